@@ -1,0 +1,213 @@
+"""Plants as goal-conditioned gymnasium environments. Every module in this folder is one plant: `--env NAME` means `envs/NAME.py`.
+
+A plant module holds plain constants and functions and no gymnasium code (`envs/cstr.py` is the pattern to copy):
+
+    ENV_ID, EPISODE_STEPS, DT                     gymnasium id, steps before truncation, sampling time
+    STATE_NAMES, STATE_UNITS, ACTION_NAMES, ...   for tables and figures
+    X_LOW, X_HIGH                                 constraint box, also the box of initial states, (n_x,)
+    OBS_LOW, OBS_HIGH                             wider box that every reachable state stays in, (n_x,)
+    U_LOW, U_HIGH                                 actuator limits, (n_u,)
+    PSI_NAMES, PSI_NOMINAL, SCENARIOS, EVAL_PSI   uncertain parameters: nominal value, named scenario sets, held-out evaluation set
+    GOAL_INDEX                                    which states the goal is about, so `x[..., GOAL_INDEX]` is the achieved goal
+    TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE
+    ERROR_SCALE                                   size of a large goal error, (n_goal,): normalises the networks' input
+    REWARD_SIGMA2, REWARD_TOLERANCE               width of the Gaussian reward, half-width of the sparse one
+    ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
+
+`GoalEnv` and `VectorGoalEnv` below turn such a module into environments; importing `envs` registers one id per module.
+"""
+
+import importlib
+import pkgutil
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+
+def stack(xp, rows):
+    """Join the components of a derivative into one array, for numpy, torch and casadi alike (components along the first axis)."""
+    if xp is np:
+        return np.array(rows)  # half the time of np.stack at a batch of 1,024
+    return xp.vertcat(*rows) if hasattr(xp, "vertcat") else xp.stack(rows)
+
+
+def rk4(ode, x, u, psi, dt, substeps, xp=np):
+    """Classical Runge-Kutta steps of `ode(x, u, psi, xp)` over `dt` with the input held (components along the first axis)."""
+    h = dt / substeps
+    for _ in range(substeps):
+        k1 = ode(x, u, psi, xp)
+        k2 = ode(x + h / 2 * k1, u, psi, xp)
+        k3 = ode(x + h / 2 * k2, u, psi, xp)
+        k4 = ode(x + h * k3, u, psi, xp)
+        k2 += k3  # in place: a fifth faster than x + h / 6 * (k1 + 2 * (k2 + k3) + k4), which it computes
+        k2 *= 2
+        k2 += k1
+        k2 += k4
+        k2 *= h / 6
+        x = x + k2
+    return x
+
+
+def names():
+    """Names of the plants in this folder, the values that `--env` takes."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def load(name):
+    """The plant module `envs/NAME.py`. Raises ValueError, with the list of what is there, if there is none."""
+    if name not in names():
+        raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(names())}")
+    return importlib.import_module(f"{__name__}.{name}")
+
+
+def sample_states(plant, rng, n):
+    """Initial states uniform in the constraint box, (n, n_x)."""
+    return rng.uniform(plant.X_LOW, plant.X_HIGH, size=(n, len(plant.X_LOW)))
+
+
+def goal_reward(plant, achieved, goal, smooth=True, sigma2=None, tolerance=None, xp=np):
+    """Reward of reaching `achieved` under `goal`, both (..., n_goal): Gaussian (eq:goalreward), or 0/1 (eq:sparsereward)."""
+    error = plant.goal_error(achieved, goal, xp)
+    if smooth:
+        return xp.exp(-(error**2).sum(-1) / (2 * (plant.REWARD_SIGMA2 if sigma2 is None else sigma2)))
+    return 1.0 * (abs(error) <= (plant.REWARD_TOLERANCE if tolerance is None else tolerance)).all(-1)
+
+
+class _PlantSpaces:
+    """Spaces and observation layout that the single and the batched environment share."""
+
+    def _set_plant(self, plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance):
+        self.plant = load(plant)
+        if scenarios not in self.plant.SCENARIOS:
+            raise ValueError(f"scenarios={scenarios!r} is not one of {', '.join(self.plant.SCENARIOS)}")
+        self.scenarios = self.plant.SCENARIOS[scenarios]
+        self.reward_shape = (smooth_reward, reward_sigma2, reward_tolerance)
+
+        def box(low, high):
+            return gym.spaces.Box(np.float64(low), np.float64(high), dtype=np.float64)
+
+        p = self.plant
+        goal_box = box(p.OBS_LOW[p.GOAL_INDEX], p.OBS_HIGH[p.GOAL_INDEX])
+        self._single_observation_space = gym.spaces.Dict(
+            observation=box(p.OBS_LOW, p.OBS_HIGH), achieved_goal=goal_box, desired_goal=box(p.GOAL_LOW, p.GOAL_HIGH)
+        )
+        self._single_action_space = gym.spaces.Box(np.float32(p.U_LOW), np.float32(p.U_HIGH), dtype=np.float32)
+
+    def compute_reward(self, achieved_goal, desired_goal, info=None):
+        """Reward, vectorised over the leading axes; equal to what `step` returned."""
+        return goal_reward(self.plant, achieved_goal, desired_goal, *self.reward_shape)
+
+    def _obs(self, x, goal):
+        return {"observation": x.copy(), "achieved_goal": x[..., self.plant.GOAL_INDEX], "desired_goal": goal.copy()}
+
+    def _clip(self, action):
+        return np.clip(np.asarray(action, dtype=np.float64), self.plant.U_LOW, self.plant.U_HIGH)
+
+
+class GoalEnv(_PlantSpaces, gym.Env):
+    """One plant as a goal environment (`Dict` observation), in physical units.
+
+    At every step the parameters psi are drawn anew from the scenario set (eq:offlineMDP). `reset(options=...)` takes
+    `state` (n_x,), `goal` (n_goal,) and `psi` (n_psi,): a given psi is held for the episode.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None):
+        self._set_plant(plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+        self.observation_space, self.action_space = self._single_observation_space, self._single_action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        options = options or {}
+        state = options.get("state", sample_states(self.plant, self.np_random, 1)[0])
+        goal = options.get("goal", self.np_random.choice(self.plant.TRAIN_GOALS))
+        self.x, self.goal = np.array(state, dtype=np.float64), np.array(goal, dtype=np.float64)
+        self.psi = options.get("psi")
+        return self._obs(self.x, self.goal), {}
+
+    def step(self, action):
+        psi = self.np_random.choice(self.scenarios) if self.psi is None else np.asarray(self.psi)
+        self.x = self.plant.step(self.x, self._clip(action), psi)
+        obs = self._obs(self.x, self.goal)
+        reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"]))
+        return obs, reward, False, False, {"psi": psi}
+
+
+class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
+    """`num_envs` copies of a plant stepped in one batch, same-step autoreset: the state before a reset is `infos["final_obs"]`.
+
+    With `branches` > 0, `infos["branch_states"]` (num_envs, branches, n_x) holds the next states under that many scenarios
+    drawn independently of the one that the episode follows.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
+                 branches=0, max_episode_steps=None):  # fmt: skip
+        self._set_plant(plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+        self.num_envs, self.branches = num_envs, branches
+        self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
+        self.single_observation_space, self.single_action_space = self._single_observation_space, self._single_action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            self.x = np.empty((self.num_envs, len(self.plant.X_LOW)))
+            self.goal = np.empty((self.num_envs, len(self.plant.GOAL_INDEX)))
+            self.t = np.zeros(self.num_envs, dtype=np.int64)
+            mask = np.ones(self.num_envs, dtype=bool)
+        self._reset_rows(mask)
+        return self._obs(self.x, self.goal), {}
+
+    def _reset_rows(self, mask):
+        n = int(mask.sum())
+        self.x[mask] = sample_states(self.plant, self.np_random, n)
+        self.goal[mask] = self.np_random.choice(self.plant.TRAIN_GOALS, size=n)
+        self.t[mask] = 0
+
+    def _draw_scenarios(self, *shape):
+        return self.scenarios[self.np_random.integers(len(self.scenarios), size=shape)]
+
+    def step(self, actions):
+        u, infos = self._clip(actions), {}
+        if self.branches:
+            shape = (self.num_envs, self.branches)
+            x, v = (np.broadcast_to(a[:, None], (*shape, a.shape[-1])) for a in (self.x, u))
+            infos["branch_states"] = self.plant.step(x, v, self._draw_scenarios(*shape))
+        infos["psi"] = self._draw_scenarios(self.num_envs)
+        self.x = self.plant.step(self.x, u, infos["psi"])
+        self.t += 1
+        obs = self._obs(self.x, self.goal)
+        rewards = self.compute_reward(obs["achieved_goal"], obs["desired_goal"])
+        truncations = self.t >= self.max_episode_steps
+        if truncations.any():
+            infos["final_obs"], infos["_final_obs"] = obs, truncations.copy()
+            self._reset_rows(truncations)
+            obs = self._obs(self.x, self.goal)
+        return obs, rewards, np.zeros(self.num_envs, dtype=bool), truncations, infos
+
+    def get_state(self):
+        """Everything that the next `step` depends on, as plain data (for checkpoints)."""
+        return {"x": self.x.tolist(), "goal": self.goal.tolist(), "t": self.t.tolist(), "rng": self.np_random.bit_generator.state}
+
+    def set_state(self, state):
+        """Continue from what `get_state` returned; returns the observation."""
+        self.x, self.goal, self.t = np.array(state["x"]), np.array(state["goal"]), np.array(state["t"])
+        self.np_random.bit_generator.state = state["rng"]
+        return self._obs(self.x, self.goal)
+
+
+for _name in names():
+    gym.register(
+        id=load(_name).ENV_ID,
+        entry_point="envs:GoalEnv",
+        vector_entry_point="envs:VectorGoalEnv",
+        max_episode_steps=load(_name).EPISODE_STEPS,
+        kwargs={"plant": _name},
+    )

@@ -1,0 +1,612 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["torch==2.13.0", "gymnasium==1.4.0", "numpy", "tyro", "tensorboard", "tqdm"]
+# ///
+"""Soft actor-critic with hindsight experience replay over branched rollouts: a robust goal-conditioned critic.
+
+The plant's uncertain parameters psi are drawn anew from a scenario set at every step (eq:offlineMDP), so that the critic
+learns the value averaged over scenarios (eq:robustQ). With `--branches K` every transition carries K next states under
+independently drawn scenarios, and their *targets* are averaged:
+
+    y = 1/K sum_i [ r(s'_i, g) + gamma ( min_j Qbar_j(s'_i, a'_i, g) - alpha log pi(a'_i | s'_i, g) ) ],   a'_i ~ pi(. | s'_i, g)
+
+HER (eq:relabeled) replaces the goal of most samples by something that the same episode achieved later.
+
+    python sac_her_branching.py --env cstr                        # the robust agent of the paper's Example 3
+    python sac_her_branching.py --env cstr --scenarios nominal    # the nominal agent it is compared with
+    python sac_her_branching.py --resume runs/NAME/resume.pt      # continue an interrupted run, to the same numbers
+
+It writes `runs/{env}__sac_her_branching__{seed}__{time}/`: tensorboard events, evaluations.csv, checkpoint.pt (what
+`load_policy` and rl_mpc_deploy.py read) and resume.pt. Only the folder `envs/` is needed beside this file.
+"""
+
+import csv
+import os
+import signal
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import envs
+
+
+@dataclass
+class Args:
+    env: str = "cstr"
+    """the plant: NAME of a module envs/NAME.py"""
+    seed: int = 0
+    """seed of networks, plants, exploration and replay; same seed, same machine, same numbers"""
+    total_timesteps: int = 100_000
+    """transitions to collect, over all parallel plants"""
+    num_envs: int = 32
+    """plants simulated in parallel"""
+    scenarios: Literal["robust", "nominal", "mpc"] = "robust"
+    """where psi is drawn from at every step: the training grid, the nominal plant, or the MPC's scenario set"""
+    branches: int = 1
+    """K, next states per transition whose targets are averaged; 1 is the paper's sampling: the one that the episode follows"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """where the networks live; auto takes cuda where there is one"""
+    torch_threads: int = 1
+    """CPU threads of torch; networks this small run fastest on one"""
+
+    her_strategy: Literal["future", "final", "episode"] = "future"
+    """hindsight goal: what was achieved later in the episode, at its end, or anywhere in it"""
+    her_ratio: float = 0.8
+    """share of the samples whose goal is replaced in hindsight; 0 turns HER off"""
+    smooth_reward: bool = True
+    """Gaussian reward (eq:cstrreward); off: the 0/1 reward (eq:sparsereward)"""
+    reward_sigma2: float | None = None
+    """sigma^2 of the Gaussian reward, squared units of the goal; default: the plant's (cstr: 1e-4)"""
+    reward_tolerance: float | None = None
+    """half-width of the 0/1 reward, units of the goal; default: the plant's (cstr: 0.01)"""
+    goal_input: Literal["error", "goal"] = "error"
+    """what the networks see beside the state: goal minus achieved goal, or the goal itself"""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """widths of the hidden layers of actor and critics (SiLU)"""
+    gamma: float = 0.99
+    """discount"""
+    tau: float = 0.005
+    """step of the target networks towards the critics after each update"""
+    batch_size: int = 256
+    """transitions per update"""
+    learning_rate: float = 1e-3
+    """of actor, critics and entropy coefficient (AdamW)"""
+    learning_starts: int = 1_000
+    """transitions with uniformly random actions before the first update"""
+    steps_per_update: int = 4
+    """transitions collected per update"""
+    buffer_size: int = 200_000
+    """transitions that the replay buffer holds"""
+    target_entropy: float | None = None
+    """entropy that the coefficient alpha is tuned to; default: minus the number of actions"""
+
+    eval_every: int = 10_000
+    """transitions between evaluations; 0: only at the end"""
+    eval_episodes: int = 200
+    """start states of an evaluation (nominal and robust)"""
+    save_every: int = 50_000
+    """transitions between checkpoints; 0: only at the end"""
+    resume: Path | None = None
+    """a resume.pt: continue that run in its folder, with its arguments (only --total-timesteps may be raised)"""
+    out: Path = Path("runs")
+    """folder that the run's own folder is made in"""
+
+
+# Networks. They see normalised inputs; `Scaling` is the only place where physical units are left and entered.
+
+
+class Scaling:
+    """Affine maps between physical and network units, kept in the checkpoint as plain lists."""
+
+    def __init__(self, x_center, x_scale, goal_center, goal_scale, error_scale, u_center, u_scale, goal_index, device="cpu"):
+        self.values = dict(x_center=x_center, x_scale=x_scale, goal_center=goal_center, goal_scale=goal_scale,
+                           error_scale=error_scale, u_center=u_center, u_scale=u_scale, goal_index=goal_index)  # fmt: skip
+        for name, value in self.values.items():
+            setattr(self, name, torch.tensor(value, device=device, dtype=torch.long if name == "goal_index" else torch.float32))
+
+    @classmethod
+    def of(cls, plant, device="cpu"):
+        def affine(low, high):
+            return ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+
+        goal = affine(plant.X_LOW[plant.GOAL_INDEX], plant.X_HIGH[plant.GOAL_INDEX])
+        return cls(*affine(plant.X_LOW, plant.X_HIGH), *goal, plant.ERROR_SCALE.tolist(), *affine(plant.U_LOW, plant.U_HIGH),
+                   plant.GOAL_INDEX, device)  # fmt: skip
+
+    def features(self, x, goal, goal_input):
+        """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_x + n_goal)."""
+        if goal_input == "error":
+            g = (goal - x[:, self.goal_index]) / self.error_scale
+        else:
+            g = (goal - self.goal_center) / self.goal_scale
+        return torch.cat([(x - self.x_center) / self.x_scale, g], dim=-1)
+
+
+class Actor(nn.Module):
+    """Tanh-Gaussian policy, features (B, n_in) -> action in [-1, 1]^n_u."""
+
+    LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0  # CleanRL's sac_continuous_action.py, after spinning-up
+
+    def __init__(self, n_in, n_u, hidden):
+        super().__init__()
+        widths = [n_in, *hidden]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
+        self.mean = nn.Linear(widths[-1], n_u)
+        self.log_std = nn.Linear(widths[-1], n_u)
+
+    def forward(self, z):
+        for layer in self.layers:
+            z = F.silu(layer(z))
+        return self.mean(z), self.log_std(z)
+
+    def act(self, z):
+        """The deterministic action mu(s, g) = tanh(mean)."""
+        return torch.tanh(self(z)[0])
+
+    def sample(self, z, generator):
+        """A sampled action (B, n_u) and its log probability (B,)."""
+        mean, log_std = self(z)
+        log_std = self.LOG_STD_MIN + 0.5 * (self.LOG_STD_MAX - self.LOG_STD_MIN) * (torch.tanh(log_std) + 1)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        pre_tanh = mean + log_std.exp() * noise
+        # log(1 - tanh(v)^2) = 2 (log 2 - v - softplus(-2v)) does not cancel where tanh saturates
+        log_prob = -0.5 * noise**2 - log_std - 0.9189385332 - 2 * (0.6931471806 - pre_tanh - F.softplus(-2 * pre_tanh))
+        return torch.tanh(pre_tanh), log_prob.sum(-1)
+
+
+class TwinCritic(nn.Module):
+    """Two Q networks evaluated as one batched product: features (B, n_in) and action (B, n_u) -> (2, B)."""
+
+    def __init__(self, n_in, n_u, hidden):
+        super().__init__()
+        widths = [n_in + n_u, *hidden, 1]
+        self.weight = nn.ParameterList(torch.empty(2, a, b) for a, b in zip(widths, widths[1:]))
+        self.bias = nn.ParameterList(torch.empty(2, 1, b) for b in widths[1:])
+        for w, b in zip(self.weight, self.bias):  # as nn.Linear starts
+            bound = w.shape[1] ** -0.5
+            nn.init.uniform_(w, -bound, bound)
+            nn.init.uniform_(b, -bound, bound)
+
+    def forward(self, z, a):
+        h = torch.cat([z, a], dim=-1).expand(2, -1, -1)
+        for w, b in zip(self.weight[:-1], self.bias[:-1]):
+            h = F.silu(torch.baddbmm(b, h, w))
+        return torch.baddbmm(self.bias[-1], h, self.weight[-1]).squeeze(-1)
+
+
+class Policy:
+    """A trained agent for people: batched numpy arrays in physical units."""
+
+    def __init__(self, plant, actor, critic, scaling, goal_input):
+        self.plant, self.actor, self.critic, self.scaling, self.goal_input = plant, actor, critic, scaling, goal_input
+
+    def _features(self, x, goal):
+        x = torch.as_tensor(np.atleast_2d(x), dtype=torch.float32, device=self.scaling.x_center.device)
+        goal = torch.as_tensor(np.atleast_2d(goal), dtype=torch.float32, device=x.device).expand(len(x), -1)
+        return self.scaling.features(x, goal, self.goal_input)
+
+    @torch.no_grad()
+    def act(self, x, goal):
+        """Deterministic action u = mu(x, goal), (B, n_x) and (n_goal,) or (B, n_goal) -> (B, n_u), physical units."""
+        return (self.actor.act(self._features(x, goal)) * self.scaling.u_scale + self.scaling.u_center).cpu().numpy()
+
+    @torch.no_grad()
+    def value(self, x, goal):
+        """V(x, goal) = min_j Q_j(x, mu(x, goal), goal), (B,). SAC's value: it contains the entropy bonus."""
+        z = self._features(x, goal)
+        return self.critic(z, self.actor.act(z)).amin(0).cpu().numpy()
+
+
+def load_policy(path, device="cpu"):
+    """The agent stored in a checkpoint.pt."""
+    data = torch.load(path, map_location=device, weights_only=True)
+    plant = envs.load(data["env"])
+    actor, critic = Actor(**data["network"]).to(device), TwinCritic(**data["network"]).to(device)
+    actor.load_state_dict(data["actor"])
+    critic.load_state_dict(data["critic"])
+    return Policy(plant, actor, critic, Scaling(**data["scaling"], device=device), data["goal_input"])
+
+
+# Replay with hindsight
+
+
+class HERBuffer:
+    """Ring buffer of whole episodes of parallel plants; goals are replaced when a batch is drawn.
+
+    Row t % rows holds time t of every plant. Example with `future`: an episode covers t = 100 ... 149 and the sample is
+    t = 120; the hindsight goal is what x_{t'+1} achieved for t' uniform in 120 ... 149, so that at least one t' is rewarded.
+    """
+
+    OPEN = 2**62  # end of an episode that is still running
+
+    def __init__(self, capacity, num_envs, n_x, n_u, n_goal, goal_index, branches, strategy, ratio, device="cpu"):
+        self.rows, self.num_envs, self.branches, self.strategy, self.ratio = capacity // num_envs, num_envs, branches, strategy, ratio
+        self.goal_index = torch.tensor(goal_index, device=device)
+        self.now = 0  # time steps written so far
+        shape = (self.rows, num_envs)
+        self.x = torch.zeros(*shape, n_x, device=device)
+        self.u = torch.zeros(*shape, n_u, device=device)
+        self.goal = torch.zeros(*shape, n_goal, device=device)
+        self.x_next = torch.zeros(*shape, n_x, device=device)
+        self.branch_next = torch.zeros(*shape, branches if branches > 1 else 0, n_x, device=device)
+        self.start = torch.zeros(shape, dtype=torch.long, device=device)  # time at which the transition's episode began
+        self.end = torch.zeros(shape, dtype=torch.long, device=device)  # its last time
+        self.episode_start = torch.zeros(num_envs, dtype=torch.long, device=device)
+
+    def add(self, x, u, goal, x_next, branch_next, done):
+        """One transition of each plant: (num_envs, ...) arrays; branch_next (num_envs, K, n_x) or None; done (num_envs,) bool."""
+        row = self.now % self.rows
+        stored = [(self.x, x), (self.u, u), (self.goal, goal), (self.x_next, x_next)]
+        for store, value in stored + ([(self.branch_next, branch_next)] if self.branches > 1 else []):
+            store[row] = torch.as_tensor(value, dtype=torch.float32)
+        self.start[row] = self.episode_start
+        self.end[row] = self.OPEN
+        if done.any():
+            done = torch.as_tensor(done, device=self.end.device)
+            self.end[(self.end == self.OPEN) & done] = self.now
+            self.episode_start[done] = self.now + 1
+        self.now += 1
+
+    def sample(self, batch_size, generator):
+        """x (B, n_x), u (B, n_u), goal (B, n_goal), next states (B, K, n_x): one goal for all branches of a transition."""
+        device, oldest = self.x.device, max(0, self.now - self.rows)
+        t = torch.randint(oldest, self.now, (batch_size,), generator=generator, device=device)
+        env = torch.randint(self.num_envs, (batch_size,), generator=generator, device=device)
+        index = t % self.rows * self.num_envs + env  # into the flattened (rows, num_envs)
+        end = self.end.view(-1)[index].clamp(max=self.now - 1)
+        first = {"future": t, "final": end, "episode": self.start.view(-1)[index].clamp(min=oldest)}[self.strategy]
+        draw, relabel = torch.rand(2, batch_size, generator=generator, device=device)
+        source = (first + (draw * (end - first + 1)).long()).clamp(max=end)
+        achieved = self.x_next.view(-1, self.x_next.shape[-1])[source % self.rows * self.num_envs + env][:, self.goal_index]
+        goal = torch.where((relabel < self.ratio)[:, None], achieved, self.goal.view(-1, self.goal.shape[-1])[index])
+        x_next = self.branch_next.flatten(0, 1)[index] if self.branches > 1 else self.x_next.flatten(0, 1)[index][:, None]
+        return self.x.flatten(0, 1)[index], self.u.flatten(0, 1)[index], goal, x_next
+
+    def state_dict(self):
+        return {k: v for k, v in vars(self).items() if torch.is_tensor(v)} | {"now": self.now}
+
+    def load_state_dict(self, state):
+        for name, value in state.items():
+            setattr(self, name, value)
+
+
+# Soft actor-critic
+
+
+class SAC:
+    """Networks, optimisers and the two update steps."""
+
+    def __init__(self, args, plant, device):
+        self.args, self.plant, self.device = args, plant, device
+        n_x, n_goal, n_u = len(plant.X_LOW), len(plant.GOAL_INDEX), len(plant.U_LOW)
+        self.network = dict(n_in=n_x + n_goal, n_u=n_u, hidden=list(args.hidden))
+        self.scaling = Scaling.of(plant, device)
+        with torch.random.fork_rng(devices=[]):  # torch.nn initialises from the global generator; leave it as it was
+            torch.manual_seed(args.seed)
+            self.actor = Actor(**self.network).to(device)
+            self.critic = TwinCritic(**self.network).to(device)
+            self.target = TwinCritic(**self.network).to(device).requires_grad_(False)
+        self.target.load_state_dict(self.critic.state_dict())
+        self.log_alpha = torch.zeros(1, requires_grad=True, device=device)
+        self.target_entropy = -float(n_u) if args.target_entropy is None else args.target_entropy
+        self.generator = torch.Generator(device=device).manual_seed(args.seed)
+
+        def optimiser(parameters):
+            return torch.optim.AdamW(parameters, lr=args.learning_rate, weight_decay=0.0, fused=True)
+
+        self.optimisers = {
+            "actor": optimiser(self.actor.parameters()),
+            "critic": optimiser(self.critic.parameters()),
+            "alpha": optimiser([self.log_alpha]),
+        }
+        self.policy = Policy(plant, self.actor, self.critic, self.scaling, args.goal_input)
+
+    def features(self, x, goal):
+        return self.scaling.features(x, goal, self.args.goal_input)
+
+    @torch.no_grad()
+    def explore(self, x, goal):
+        """Sampled actions in physical units, (num_envs, n_u)."""
+        x, goal = (torch.as_tensor(v, dtype=torch.float32, device=self.device) for v in (x, goal))
+        a = self.actor.sample(self.features(x, goal), self.generator)[0]
+        return (a * self.scaling.u_scale + self.scaling.u_center).cpu().numpy()
+
+    def targets(self, goal, x_next):
+        """Mean over branches of reward + discounted soft value of the next state, (B,): eq:robustQ with the entropy term."""
+        a = self.args
+        batch, k = x_next.shape[:2]
+        x, g = x_next.flatten(0, 1), goal.repeat_interleave(k, dim=0)  # (B*K, n_x), (B*K, n_goal)
+        z = self.features(x, g)
+        action, log_prob = self.actor.sample(z, self.generator)
+        achieved = x[:, self.scaling.goal_index]
+        reward = envs.goal_reward(self.plant, achieved, g, a.smooth_reward, a.reward_sigma2, a.reward_tolerance, xp=torch)
+        # the plants do not terminate, and the time limit is bootstrapped through
+        y = reward + a.gamma * (self.target(z, action).amin(0) - self.log_alpha.exp() * log_prob)
+        return y.view(batch, k).mean(1)
+
+    def update_critic(self, x, u, goal, x_next):
+        """One step of both critics; returns (loss, mean Q, mean target)."""
+        with torch.no_grad():
+            y = self.targets(goal, x_next)
+        q = self.critic(self.features(x, goal), (u - self.scaling.u_center) / self.scaling.u_scale)
+        loss = 2 * F.mse_loss(q, y.expand(2, -1))  # the sum of both critics' losses
+        self.optimisers["critic"].zero_grad()
+        loss.backward()
+        self.optimisers["critic"].step()
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), self.args.tau)
+        return loss.detach(), q.detach().mean(), y.mean()
+
+    def update_actor(self, x, goal):
+        """One step of the actor and the entropy coefficient; returns (actor loss, alpha, entropy)."""
+        z = self.features(x, goal)
+        action, log_prob = self.actor.sample(z, self.generator)
+        alpha = self.log_alpha.exp().detach()
+        loss = (alpha * log_prob - self.critic(z, action).amin(0)).mean()
+        self.optimisers["actor"].zero_grad()
+        loss.backward()
+        self.optimisers["actor"].step()
+        entropy = -log_prob.detach().mean()
+        self.optimisers["alpha"].zero_grad()
+        (self.log_alpha.exp() * (entropy - self.target_entropy)).backward()
+        self.optimisers["alpha"].step()
+        return loss.detach(), alpha, entropy
+
+    def state_dict(self):
+        modules = {name: getattr(self, name).state_dict() for name in ("actor", "critic", "target")}
+        optimisers = {name: optimiser.state_dict() for name, optimiser in self.optimisers.items()}
+        return modules | {"log_alpha": self.log_alpha.detach(), "optimisers": optimisers, "rng": self.generator.get_state()}
+
+    def load_state_dict(self, state):
+        for name in ("actor", "critic", "target"):
+            getattr(self, name).load_state_dict(state[name])
+        for name, optimiser in self.optimisers.items():
+            optimiser.load_state_dict(state["optimisers"][name])
+        self.log_alpha.data.copy_(state["log_alpha"])
+        self.generator.set_state(state["rng"].cpu())
+
+
+# Evaluation and files
+
+
+def evaluate(policy, goal, episodes, seed, robust, steps=50, tail=25):
+    """The paper's protocol: start states uniform in the constraint box, 50 steps, error over the last 25.
+
+    Robust: psi drawn per episode from the plant's evaluation set and held; otherwise the nominal plant. Returns the mean
+    absolute percentage error of each episode (episodes,) and whether its plant is held out from the training grid (episodes,).
+    """
+    plant, rng = policy.plant, np.random.default_rng(seed)
+    x = envs.sample_states(plant, rng, episodes)
+    psi = rng.choice(plant.EVAL_PSI, size=episodes)
+    if not robust:
+        psi = np.broadcast_to(plant.PSI_NOMINAL, psi.shape)
+    errors = []
+    for t in range(steps):
+        x = plant.step(x, policy.act(x, goal), psi)
+        if t >= steps - tail:
+            errors.append(plant.percentage_error(x[:, plant.GOAL_INDEX], np.asarray(goal)))
+    held_out = ~np.isclose(psi[:, None], plant.SCENARIOS["robust"]).all(-1).any(-1)
+    return np.mean(errors, axis=0), held_out
+
+
+def evaluation_row(policy, episodes, seed):
+    """Medians and 75th percentiles that evaluations.csv and tensorboard report, in percent."""
+    robust, held_out = evaluate(policy, policy.plant.EVAL_GOAL, episodes, seed, robust=True)
+    nominal, _ = evaluate(policy, policy.plant.EVAL_GOAL, episodes, seed, robust=False)
+    return {
+        "robust_median_ape": float(np.median(robust)),
+        "robust_p75_ape": float(np.quantile(robust, 0.75)),
+        "robust_held_out_median_ape": float(np.median(robust[held_out])) if held_out.any() else float("nan"),
+        "nominal_median_ape": float(np.median(nominal)),
+        "nominal_p75_ape": float(np.quantile(nominal, 0.75)),
+    }
+
+
+def save(data, path):
+    """Write a checkpoint so that a killed process never leaves half a file: temporary name, flush, rename."""
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "wb") as file:
+        torch.save(data, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def checkpoint(agent, args, step):
+    """What deployment needs, as plain data (loads with weights_only=True)."""
+    return {
+        "format": "rlmpc-sac-her-branching-1",
+        "env": args["env"],
+        "env_id": agent.plant.ENV_ID,
+        "network": agent.network,
+        "goal_input": args["goal_input"],
+        "scaling": agent.scaling.values,
+        "actor": {k: v.cpu() for k, v in agent.actor.state_dict().items()},
+        "critic": {k: v.cpu() for k, v in agent.critic.state_dict().items()},
+        "gamma": args["gamma"],
+        "alpha": float(agent.log_alpha.exp()),
+        "step": step,
+        "args": args,
+    }
+
+
+def write_rows(rows, path):
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def fail(message):
+    """A user's mistake: one sentence, exit code 2, no traceback."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def check(args):
+    """Refuse arguments that cannot work, before anything long starts; returns the plant module."""
+    try:
+        plant = envs.load(args.env)
+    except ValueError as error:
+        fail(error)
+    for name in ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"):
+        if getattr(args, name) < 1:
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be at least 1")
+    for name in ("learning_starts", "eval_every", "save_every", "seed"):
+        if getattr(args, name) < 0:
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must not be negative")
+    for name, low, high in (("her_ratio", 0, 1), ("gamma", 0, 1), ("tau", 0, 1)):
+        if not low <= getattr(args, name) <= high:
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{low}, {high}]")
+    for name in ("learning_rate", "reward_sigma2", "reward_tolerance"):
+        if getattr(args, name) is not None and not getattr(args, name) > 0:
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be positive")
+    if not args.hidden or min(args.hidden) < 1:
+        fail(f"--hidden is {args.hidden}; it needs at least one width, each at least 1")
+    if args.buffer_size < args.num_envs:
+        fail(f"--buffer-size is {args.buffer_size}; it must hold at least one transition of each of the {args.num_envs} plants")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        fail("--device is cuda, but torch finds no CUDA device here; use auto or cpu")
+    return plant
+
+
+def load_resume(path, given):
+    """Arguments and state of an interrupted run; of the arguments given now, only total_timesteps is taken."""
+    try:
+        state = torch.load(path, weights_only=True, map_location="cpu")
+        if state["format"] != "rlmpc-resume-1":
+            raise KeyError("format")
+    except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
+        fail(f"--resume {path}: not a resume.pt of this script ({type(error).__name__})")
+    types = {f.name: f.type for f in fields(Args)}
+    stored = {k: tuple(v) if k == "hidden" else Path(v) if types[k] in (Path, Path | None) and v else v for k, v in state["args"].items()}
+    args = Args(**stored)
+    args.total_timesteps = max(args.total_timesteps, given.total_timesteps)
+    return args, state
+
+
+def main(args):
+    state = None
+    if args.resume:
+        run_dir = args.resume.parent
+        args, state = load_resume(args.resume, args)
+    plant = check(args)
+    if state is None:
+        run_dir = args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        writer = SummaryWriter(run_dir, purge_step=state["step"] if state else None)
+    except OSError as error:
+        fail(f"--out {args.out}: cannot write there ({error.strerror})")
+    device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu"))
+    torch.set_num_threads(args.torch_threads)
+    plain_args = {k: str(v) if isinstance(v, Path) else list(v) if isinstance(v, tuple) else v for k, v in asdict(args).items()}
+    writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in plain_args.items()))
+
+    vec = gym.make_vec(plant.ENV_ID, num_envs=args.num_envs, scenarios=args.scenarios, smooth_reward=args.smooth_reward,
+                       reward_sigma2=args.reward_sigma2, reward_tolerance=args.reward_tolerance,
+                       branches=args.branches if args.branches > 1 else 0).unwrapped  # fmt: skip
+    agent = SAC(args, plant, device)
+    buffer = HERBuffer(args.buffer_size, args.num_envs, len(plant.X_LOW), len(plant.U_LOW), len(plant.GOAL_INDEX),
+                       plant.GOAL_INDEX, args.branches, args.her_strategy, args.her_ratio, device)  # fmt: skip
+    rng = np.random.default_rng(args.seed)  # random actions before learning starts
+    obs, _ = vec.reset(seed=args.seed)
+    returns, finished, step, updates, seconds, rows = np.zeros(args.num_envs), [], 0, 0, 0.0, []
+    if state:
+        agent.load_state_dict(state["agent"])
+        buffer.load_state_dict({k: v.to(device) if torch.is_tensor(v) else v for k, v in state["buffer"].items()})
+        obs = vec.set_state(state["vec"])
+        rng.bit_generator.state = state["rng"]
+        returns, finished, step, updates, seconds, rows = (state[k] for k in ("returns", "finished", "step", "updates", "seconds", "rows"))
+        returns = np.array(returns)
+
+    def save_all():
+        save(checkpoint(agent, plain_args, step), run_dir / "checkpoint.pt")
+        resume = {"format": "rlmpc-resume-1", "args": plain_args, "agent": agent.state_dict(), "buffer": buffer.state_dict(),
+                  "vec": vec.get_state(), "rng": rng.bit_generator.state, "returns": returns.tolist(), "finished": finished,
+                  "step": step, "updates": updates, "seconds": seconds, "rows": rows}  # fmt: skip
+        save(resume, run_dir / "resume.pt")
+
+    def due(every):
+        return every > 0 and step // every > (step - args.num_envs) // every
+
+    def log(scalars):
+        for name, value in scalars.items():
+            writer.add_scalar(name, float(value), step)
+
+    interrupted = []  # Ctrl-C is acted on between steps, where the state is whole; a second one kills
+    previous_handler = signal.signal(signal.SIGINT, lambda *_: (interrupted.append(True), signal.signal(signal.SIGINT, signal.SIG_DFL)))
+    bar = tqdm(total=args.total_timesteps, initial=step, unit="step", mininterval=0.5, disable=None)
+    try:
+        while step < args.total_timesteps and not interrupted:
+            tick = time.perf_counter()
+            if step < args.learning_starts:
+                action = rng.uniform(plant.U_LOW, plant.U_HIGH, size=(args.num_envs, len(plant.U_LOW)))
+            else:
+                action = agent.explore(obs["observation"], obs["desired_goal"])
+            next_obs, reward, terminated, truncated, infos = vec.step(action)
+            done = terminated | truncated
+            # same-step autoreset: where an episode ended, the state that it reached is in final_obs
+            reached = infos["final_obs"]["observation"] if "final_obs" in infos else next_obs["observation"]
+            buffer.add(obs["observation"], action, obs["desired_goal"], reached, infos.get("branch_states"), done)
+            obs = next_obs
+            step += args.num_envs
+            returns += reward
+            if done.any():
+                finished = returns[done].tolist()
+                returns[done] = 0
+            if step >= args.learning_starts:
+                while updates * args.steps_per_update < step - args.learning_starts:
+                    x, u, goal, x_next = buffer.sample(args.batch_size, agent.generator)
+                    critic_loss, q, y = agent.update_critic(x, u, goal, x_next)
+                    actor_loss, alpha, entropy = agent.update_actor(x, goal)
+                    updates += 1
+            seconds += time.perf_counter() - tick
+            bar.update(args.num_envs)
+            if due(1_000) and updates:
+                log({"losses/qf_loss": critic_loss, "losses/qf_values": q, "losses/targets": y, "losses/actor_loss": actor_loss,
+                     "losses/alpha": alpha, "losses/entropy": entropy, "charts/SPS": step / seconds})  # fmt: skip
+                if finished:
+                    log({"charts/episodic_return": np.mean(finished)})
+            if due(args.eval_every) or step >= args.total_timesteps:
+                row = evaluation_row(agent.policy, args.eval_episodes, seed=args.seed)
+                log({f"eval/{name}": value for name, value in row.items()})
+                rows.append({"step": step, "updates": updates, "train_seconds": round(seconds, 2)} | row)
+                write_rows(rows, run_dir / "evaluations.csv")
+                bar.set_postfix_str(f"robust error {row['robust_median_ape']:.2f} %, nominal {row['nominal_median_ape']:.2f} %")
+            if due(args.save_every):
+                save_all()
+    finally:
+        bar.close()
+        writer.close()
+        signal.signal(signal.SIGINT, previous_handler)
+    save_all()
+    if interrupted:
+        print(f"interrupted at step {step}; continue with: python sac_her_branching.py --resume {run_dir / 'resume.pt'}")
+        raise SystemExit(130)
+    last = rows[-1]
+    print(f"""
+{plant.ENV_ID}, {args.scenarios} scenarios, seed {args.seed}: {step} transitions, {updates} updates, {seconds:.0f} s, {step / seconds:.0f} steps/s
+absolute percentage error, goal {plant.EVAL_GOAL}   median   75th percentile
+  robust evaluation, all plants      {last["robust_median_ape"]:10.2f} {last["robust_p75_ape"]:12.2f}
+  robust evaluation, held-out plants {last["robust_held_out_median_ape"]:10.2f}
+  nominal evaluation                 {last["nominal_median_ape"]:10.2f} {last["nominal_p75_ape"]:12.2f}
+entropy coefficient {agent.log_alpha.exp().item():.2e}
+{run_dir / "checkpoint.pt"}""")
+    return run_dir
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
