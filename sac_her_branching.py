@@ -83,6 +83,8 @@ class Args:
     """transitions per update"""
     learning_rate: float = 1e-3
     """of actor, critics and entropy coefficient (AdamW)"""
+    learning_rate_end: float = 1.0
+    """learning rate at the end of the run, as a share of the initial one (falls linearly)"""
     learning_starts: int = 1_000
     """transitions with uniformly random actions before the first update"""
     steps_per_update: int = 4
@@ -143,13 +145,12 @@ class Actor(nn.Module):
         super().__init__()
         widths = [n_in, *hidden]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
-        self.mean = nn.Linear(widths[-1], n_u)
-        self.log_std = nn.Linear(widths[-1], n_u)
+        self.head = nn.Linear(widths[-1], 2 * n_u)  # mean and log standard deviation before tanh
 
     def forward(self, z):
         for layer in self.layers:
             z = F.silu(layer(z))
-        return self.mean(z), self.log_std(z)
+        return self.head(z).chunk(2, dim=-1)
 
     def act(self, z):
         """The deterministic action mu(s, g) = tanh(mean)."""
@@ -313,6 +314,10 @@ class SAC:
         }
         self.policy = Policy(plant, self.actor, self.critic, self.scaling, args.goal_input)
 
+    def set_learning_rate(self, learning_rate):
+        for optimiser in self.optimisers.values():
+            optimiser.param_groups[0]["lr"] = learning_rate
+
     def features(self, x, goal):
         return self.scaling.features(x, goal, self.args.goal_input)
 
@@ -353,14 +358,13 @@ class SAC:
         """One step of the actor and the entropy coefficient; returns (actor loss, alpha, entropy)."""
         z = self.features(x, goal)
         action, log_prob = self.actor.sample(z, self.generator)
-        alpha = self.log_alpha.exp().detach()
+        alpha = self.log_alpha.detach().exp()
         loss = (alpha * log_prob - self.critic(z, action).amin(0)).mean()
         self.optimisers["actor"].zero_grad()
-        loss.backward()
+        loss.backward(inputs=list(self.actor.parameters()))  # the critics' weight gradients are not wanted here
         self.optimisers["actor"].step()
         entropy = -log_prob.detach().mean()
-        self.optimisers["alpha"].zero_grad()
-        (self.log_alpha.exp() * (entropy - self.target_entropy)).backward()
+        self.log_alpha.grad = alpha * (entropy - self.target_entropy)  # of exp(log_alpha) * (entropy - target_entropy)
         self.optimisers["alpha"].step()
         return loss.detach(), alpha, entropy
 
@@ -436,7 +440,7 @@ def checkpoint(agent, args, step):
         "actor": {k: v.cpu() for k, v in agent.actor.state_dict().items()},
         "critic": {k: v.cpu() for k, v in agent.critic.state_dict().items()},
         "gamma": args["gamma"],
-        "alpha": float(agent.log_alpha.exp()),
+        "alpha": agent.log_alpha.exp().item(),
         "step": step,
         "args": args,
     }
@@ -544,7 +548,7 @@ def main(args):
 
     def log(scalars):
         for name, value in scalars.items():
-            writer.add_scalar(name, float(value), step)
+            writer.add_scalar(name, value, step)
 
     interrupted = []  # Ctrl-C is acted on between steps, where the state is whole; a second one kills
     previous_handler = signal.signal(signal.SIGINT, lambda *_: (interrupted.append(True), signal.signal(signal.SIGINT, signal.SIG_DFL)))
@@ -568,6 +572,7 @@ def main(args):
                 finished = returns[done].tolist()
                 returns[done] = 0
             if step >= args.learning_starts:
+                agent.set_learning_rate(args.learning_rate * (1 + (args.learning_rate_end - 1) * step / args.total_timesteps))
                 while updates * args.steps_per_update < step - args.learning_starts:
                     x, u, goal, x_next = buffer.sample(args.batch_size, agent.generator)
                     critic_loss, q, y = agent.update_critic(x, u, goal, x_next)

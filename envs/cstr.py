@@ -39,6 +39,12 @@ SCENARIOS = {
 }
 EVAL_PSI = _grid(np.linspace(1.05, 0.95, 7), np.linspace(1.1, 0.9, 8))  # 8 of the 56 lie on the training grid
 
+BENCHMARK = {  # the MPC that the paper compares with: hard bounds but for the upper one of T_R, quadratic cost
+    "horizon": 20,
+    "slack_price": np.array([[np.inf, np.inf, np.inf, np.inf], [np.inf, np.inf, 100.0, np.inf]]),  # below, above
+    "change_weight": np.array([0.1 / 100**2, 1e-3 / 2000**2]),
+}
+
 GOAL_INDEX = [1]  # the goal is a concentration c_B, mol/l
 TRAIN_GOALS = np.array([[0.6], [0.7], [0.8]])
 EVAL_GOAL = np.array([0.65])

@@ -1,0 +1,608 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["torch==2.13.0", "gymnasium==1.4.0", "casadi==3.8.2", "numpy", "scipy", "tyro", "matplotlib", "tqdm"]
+# ///
+"""The deployed controller: short-horizon scenario MPC whose terminal cost is a learned goal-conditioned critic (eq:QMPC).
+
+    minimise over u   1/S sum_i { sum_{t=1}^{N} [ w' |eps_t^i| - exp(-|g - x_t^i|^2 / (2 sigma^2)) ] - V(x_N^i, g) }
+    subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi^i),   x_0^i = s,   u_0^i = u_0^j,   x_t^i - eps_t^i in X,   u_t^i in U
+
+with V(x, g) = Q(x, mu(x, g), g) from a checkpoint of sac_her_branching.py, rebuilt in CasADi. The sums start at x_1: x_0 is
+measured, its reward is a constant, and V(x_N) counts rewards from x_{N+1} on. The controller is compared, on paired draws of
+start state and plant, with the actor alone and with nominal and robust MPC.
+
+    python rl_mpc_deploy.py --horizon 5                                            # with the critic that the repository ships
+    python rl_mpc_deploy.py --horizon 5 --critic runs/NAME/checkpoint.pt           # with your own
+    python rl_mpc_deploy.py --horizon 0 --episodes 20 --goal 0.7 --jobs 2          # no prediction: the critic's best action
+
+It writes `runs/{env}__rl_mpc_deploy__{seed}__{time}/`: results.csv (a row per controller and episode), trajectories.npz and
+episode.png. Only the folder `envs/` is needed beside this file, and a checkpoint.
+"""
+
+import csv
+import hashlib
+import json
+import multiprocessing
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from scipy.optimize import minimize
+from tqdm import tqdm
+
+import envs
+
+MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in the prediction; the simulated plant takes 8
+METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
+COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+
+
+@dataclass(frozen=True)
+class Args:
+    env: str = "cstr"
+    """the plant: NAME of a module envs/NAME.py; must be the one that the critic was trained on"""
+    horizon: int = 5
+    """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
+    critic: Path = Path(__file__).parent / "experiments/pretrained/cstr_robust.pt"
+    """a checkpoint.pt of sac_her_branching.py"""
+    goal: float | None = None
+    """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
+    episodes: int = 4
+    """paired draws of start state and plant parameters"""
+    steps: int = 100
+    """sampling times per episode"""
+    seed: int = 0
+    """seed of the draws"""
+    jobs: int = 2
+    """processes; the results do not depend on it, but for the times"""
+
+    robust_horizon: int = 1
+    """stages at which the scenario tree branches; 0: the nominal model alone"""
+    sigma: float = 0.1
+    """width of the Gaussian stage cost, units of the goal (the paper's text says 0.25, its script 0.1)"""
+    slack_weight: float = 1.0
+    """price of a constraint violation, per physical unit (mol/l, degC) and step"""
+    constraints: Literal["soft", "hard"] = "soft"
+    """hard: the paper's variant that gets stuck or infeasible"""
+    value: Literal["min", "first", "mean"] = "min"
+    """which of the twin critics the terminal value takes"""
+    controllers: tuple[str, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
+    """which controllers to compare"""
+    compile: bool = True
+    """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc)"""
+    out: Path | None = None
+    """folder of the results; default: runs/{env}__rl_mpc_deploy__{seed}__{time}"""
+
+
+# Networks, as in sac_her_branching.py: a checkpoint loads into them with strict=True
+
+
+class Scaling:
+    """Affine maps between physical and network units, kept in the checkpoint as plain lists."""
+
+    def __init__(self, **values):
+        for name, value in values.items():
+            setattr(self, name, torch.tensor(value, dtype=torch.long if name == "goal_index" else torch.float64))
+
+    def features(self, x, goal, goal_input):
+        """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_x + n_goal)."""
+        if goal_input == "error":
+            g = (goal - x[:, self.goal_index]) / self.error_scale
+        else:
+            g = (goal - self.goal_center) / self.goal_scale
+        return torch.cat([(x - self.x_center) / self.x_scale, g], dim=-1)
+
+
+class Actor(nn.Module):
+    """Mean of the tanh-Gaussian policy, features (B, n_in) -> action in [-1, 1]^n_u."""
+
+    def __init__(self, n_in, n_u, hidden):
+        super().__init__()
+        widths = [n_in, *hidden]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
+        self.head = nn.Linear(widths[-1], 2 * n_u)  # mean and log standard deviation; deployment needs the mean
+
+    def act(self, z):
+        for layer in self.layers:
+            z = F.silu(layer(z))
+        return torch.tanh(self.head(z).chunk(2, dim=-1)[0])
+
+
+class TwinCritic(nn.Module):
+    """Two Q networks evaluated as one batched product: features (B, n_in) and action (B, n_u) -> (2, B)."""
+
+    def __init__(self, n_in, n_u, hidden):
+        super().__init__()
+        widths = [n_in + n_u, *hidden, 1]
+        self.weight = nn.ParameterList(torch.empty(2, a, b) for a, b in zip(widths, widths[1:]))
+        self.bias = nn.ParameterList(torch.empty(2, 1, b) for b in widths[1:])
+
+    def forward(self, z, a):
+        h = torch.cat([z, a], dim=-1).expand(2, -1, -1)
+        for w, b in zip(self.weight[:-1], self.bias[:-1]):
+            h = F.silu(torch.baddbmm(b, h, w))
+        return torch.baddbmm(self.bias[-1], h, self.weight[-1]).squeeze(-1)
+
+
+class Critic:
+    """Actor and twin critics of a checkpoint in float64: float32 noise (1e-6 at |V| = 40) is above the solver's tolerance."""
+
+    COMBINE = {"min": lambda q: q.amin(0), "first": lambda q: q[0], "mean": lambda q: q.mean(0)}
+
+    def __init__(self, data, value="min"):
+        self.data, self.combine = data, value
+        self.actor, self.critic = Actor(**data["network"]).double(), TwinCritic(**data["network"]).double()
+        self.actor.load_state_dict(data["actor"])
+        self.critic.load_state_dict(data["critic"])
+        self.scaling = Scaling(**data["scaling"])
+
+    def value(self, x, goal):
+        """V(x, g) = Q(x, mu(x, g), g) in torch, (B, n_x) and (B, n_goal) -> (B,)."""
+        z = self.scaling.features(x, goal, self.data["goal_input"])
+        return self.COMBINE[self.combine](self.critic(z, self.actor.act(z)))
+
+
+def load_critic(path, env=None, value="min"):
+    """The actor and critic stored in a checkpoint.pt. Raises ValueError, one sentence, for anything else."""
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist; it must be a checkpoint.pt written by sac_her_branching.py") from None
+    except Exception as error:  # a text file, a truncated file, a folder, a pickle of code: torch raises many types
+        raise ValueError(f"{path} is not a readable checkpoint of sac_her_branching.py ({type(error).__name__})") from None
+    if not isinstance(data, dict) or data.get("format") != "rlmpc-sac-her-branching-1":
+        raise ValueError(f"{path} is a torch file, but not a checkpoint.pt of sac_her_branching.py")
+    if env is not None and data["env"] != env:
+        raise ValueError(f"{path} was trained on {data['env']!r}, not on {env!r}; --env and --critic must match")
+    try:
+        critic = Critic(data, value)
+    except (RuntimeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} has weights that do not fit its own description ({type(error).__name__})") from None
+    if not all(p.isfinite().all() for p in [*critic.actor.parameters(), *critic.critic.parameters()]):
+        raise ValueError(f"{path} has weights that are not finite")
+    return critic
+
+
+# CasADi export
+
+
+def export(critic):
+    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64."""
+
+    def array(tensor):
+        return tensor.detach().double().numpy()
+
+    def mlp(layers, h):
+        for i, (w, b) in enumerate(layers):
+            h = w @ h + b
+            if i < len(layers) - 1:
+                h = h * (1 + ca.tanh(h / 2)) / 2  # SiLU; exp(-h) would overflow in its derivatives
+        return h
+
+    scaling, net = {k: array(v) for k, v in vars(critic.scaling).items()}, critic.data["network"]
+    n_x, n_goal, n_u = len(scaling["x_center"]), len(scaling["goal_center"]), net["n_u"]
+    x, goal, u = ca.MX.sym("x", n_x), ca.MX.sym("goal", n_goal), ca.MX.sym("u", n_u)
+    achieved = x[critic.scaling.goal_index.tolist()]
+    if critic.data["goal_input"] == "error":
+        g = (goal - achieved) / scaling["error_scale"]
+    else:
+        g = (goal - scaling["goal_center"]) / scaling["goal_scale"]
+    z = ca.vertcat((x - scaling["x_center"]) / scaling["x_scale"], g)
+    actor_layers = [(array(layer.weight), array(layer.bias)) for layer in [*critic.actor.layers, critic.actor.head]]
+    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor_layers, z)[:n_u]) * scaling["u_scale"] + scaling["u_center"]])
+    za = ca.vertcat(z, (u - scaling["u_center"]) / scaling["u_scale"])
+    q = [mlp([(array(w[j]).T, array(b[j, 0])) for w, b in zip(critic.critic.weight, critic.critic.bias)], za) for j in range(2)]
+    combined = {"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]
+    Q = ca.Function("Q", [x, u, goal], [combined])
+    V = ca.Function("V", [x, goal], [Q(x, mu(x, goal), goal)], ["x", "goal"], ["V"])
+    return mu, Q, V
+
+
+def check_export(critic, V, plant, points=64, tolerance=1e-8):
+    """Compare value and gradient with torch at random states; returns the largest scaled difference, raises if it is too large."""
+    rng = np.random.default_rng(0)
+    x = torch.tensor(envs.sample_states(plant, rng, points), requires_grad=True)
+    goal = torch.tensor(rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW))))
+    value = critic.value(x, goal)
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    gradient = (gradient * critic.scaling.x_scale).detach().numpy()  # per unit of the network's input, as the value is
+    xs, gs = ca.MX.sym("x", V.size1_in(0)), ca.MX.sym("goal", V.size1_in(1))
+    both = ca.Function("both", [xs, gs], [V(xs, gs), ca.gradient(V(xs, gs), xs)]).map(points)
+    v, dv = (np.array(a) for a in both(x.detach().numpy().T, goal.numpy().T))
+    dv = dv.T * critic.scaling.x_scale.numpy()
+    scale = 1 + np.abs(value.detach().numpy()).max()
+    worst = max(np.abs(v[0] - value.detach().numpy()).max(), np.abs(dv - gradient).max()) / scale
+    if not worst < tolerance:
+        raise RuntimeError(f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run")
+    return worst
+
+
+# Scenario MPC
+
+
+def compiled_nlp(nlp, name):
+    """Path of a shared object with the functions of an NLP and their derivatives; None where there is no C compiler.
+
+    The file is kept in a cache folder under a hash of its source and the compiler, and appears there by an atomic rename, so
+    that parallel processes may race for it.
+    """
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
+    if compiler is None:
+        return None
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rlmpc"
+    with tempfile.TemporaryDirectory() as folder:
+        previous = os.getcwd()
+        os.chdir(folder)  # CasADi writes the source into the current folder
+        try:
+            ca.nlpsol("nlp", "ipopt", nlp).generate_dependencies("nlp.c")
+        finally:
+            os.chdir(previous)
+        source = Path(folder) / "nlp.c"
+        key = hashlib.sha256(source.read_bytes() + f"{compiler} {COMPILER_FLAGS} {platform.processor()}".encode()).hexdigest()[:24]
+        library = cache / f"{name}-{key}.so"
+        if not library.exists():
+            cache.mkdir(parents=True, exist_ok=True)
+            built = cache / f"{library.name}.{os.getpid()}"
+            subprocess.run([compiler, *COMPILER_FLAGS, str(source), "-o", str(built), "-lm"], check=True, capture_output=True)
+            os.replace(built, library)
+    return library
+
+
+class ScenarioMPC:
+    """eq:QMPC (with a learned value) or eq:multiMPCobj (without), by multiple shooting over a scenario tree.
+
+    stage_cost, terminal_cost: CasADi functions (x, goal) -> scalar, to be minimised; terminal_cost may be None.
+    scenarios: (S, n_psi); the first is the nominal one. robust_horizon: stages at which the tree branches, 0 = nominal.
+    slack_price: (2, n_x), price per physical unit below X_LOW and above X_HIGH; inf makes the bound hard.
+    relaxed_price: if given, an unsuccessful solve is repeated with every bound soft at this price.
+    change_weight: (n_u,), price of the squared change of each action, summed over scenarios.
+    actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
+    """
+
+    def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
+                 relaxed_price=None, change_weight=None, actor=None, compile=True):  # fmt: skip
+        if horizon < 1:
+            raise ValueError(f"horizon is {horizon}; it must be at least 1")
+        self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
+        self.scenarios = np.asarray(scenarios if robust_horizon else scenarios[:1])
+        self.stage_cost, self.terminal_cost = stage_cost, terminal_cost
+        self.goal = np.array(goal, dtype=float)
+        self.n_x, self.n_u = len(plant.X_LOW), len(plant.U_LOW)
+        self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
+        self.relaxed_price = relaxed_price
+        self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight)
+        self.x_center, self.x_scale = (plant.X_LOW + plant.X_HIGH) / 2, (plant.X_HIGH - plant.X_LOW) / 2
+        self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
+        self._build_tree()
+        self._build_problem()
+        self._build_solvers(compile)
+        self.reset()
+
+    def _build_tree(self):
+        """nodes[t]: how many; parent[t], psi[t]: where node j of stage t comes from and under which scenario."""
+        S, R = len(self.scenarios), self.robust_horizon
+        self.nodes = [S ** min(t, R) for t in range(self.horizon + 1)]
+        self.parent = [None] + [np.arange(n) // S if t < R else np.arange(n) for t, n in enumerate(self.nodes[1:])]
+        self.psi = [None] + [self.scenarios[np.arange(n) % S].T for n in self.nodes[1:]]  # (n_psi, nodes)
+
+    def _build_problem(self):
+        """Variables, constraints and objective of eq:QMPC, stage by stage, scaled so that the box becomes [-1, 1]."""
+        n_x, n_u, plant = self.n_x, self.n_u, self.plant
+        x_now, goal, u_before = ca.MX.sym("x_now", n_x), ca.MX.sym("goal", len(self.goal)), ca.MX.sym("u_before", n_u)
+        price = ca.MX.sym("price", n_x, 2)  # of slack below and above
+        w, lbw, ubw, J, g, lbg, ubg = [], [], [], 0, [], [], []
+        self.blocks = []  # (name, stage, first index into w, rows, nodes)
+        step = self._model_step()
+
+        def variable(name, t, rows, nodes, low, high):
+            self.blocks.append((name, t, sum(v.numel() for v in w), rows, nodes))
+            w.append(ca.MX.sym(f"{name}_{t}", rows, nodes))
+            lbw.append(np.full(rows * nodes, low))
+            ubw.append(np.full(rows * nodes, high))
+            return w[-1]
+
+        def constrain(expression, low, high):
+            g.append(expression)
+            lbg.append(np.tile(low, expression.shape[1]))
+            ubg.append(np.tile(high, expression.shape[1]))
+
+        x, u_parent = x_now, u_before  # physical units, one column per node
+        for t in range(self.horizon):
+            n, n_next = self.nodes[t], self.nodes[t + 1]
+            # u_t at every node: before the tree branches, scenarios share it
+            u = variable("u", t, n_u, n, -1.0, 1.0) * self.u_scale + self.u_center
+            # x_{t+1} = f(x_t, u_t, psi)
+            x_next = variable("x", t + 1, n_x, n_next, -np.inf, np.inf) * self.x_scale + self.x_center
+            parent = self.parent[t + 1].tolist()
+            predicted = step.map(n_next)(x[:, parent], u[:, parent], self.psi[t + 1])
+            constrain((predicted - x_next) / self.x_scale, np.zeros(n_x), np.zeros(n_x))
+            # X_LOW <= x_{t+1} + below - above <= X_HIGH, slack >= 0; a hard bound is a slack fixed at zero
+            below = variable("below", t + 1, n_x, n_next, 0.0, np.inf)
+            above = variable("above", t + 1, n_x, n_next, 0.0, np.inf)
+            constrain((x_next - self.x_center) / self.x_scale + below - above, -np.ones(n_x), np.ones(n_x))
+            slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
+            J += ca.sum2(slack_cost + self.stage_cost.map(n_next)(x_next, ca.repmat(goal, 1, n_next))) / n_next
+            change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
+            # not averaged, as in the reference: the first action's change counts once per scenario
+            J += n_next / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
+            x, u_parent = x_next, u
+        if self.terminal_cost is not None:
+            J += ca.sum2(self.terminal_cost.map(n_next)(x, ca.repmat(goal, 1, n_next))) / n_next
+        self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price), "f": J, "g": ca.veccat(*g)}
+        self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
+        self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
+        self.step_nodes = {n: step.map(n) for n in set(self.nodes)}
+
+    def _model_step(self):
+        """Prediction model (x, u, psi) -> x one sampling time later."""
+        x, u, psi = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u), ca.SX.sym("psi", self.scenarios.shape[1])
+        dt, plant = self.plant.DT / MODEL_SUBSTEPS, self.plant
+        # one substep is the unit that is differentiated and compiled: unrolled, the four take three times as long to compile
+        substep = ca.Function("substep", [x, u, psi], [envs.rk4(plant.ode, x, u, psi, dt, 1, ca)], {"never_inline": True})
+        x, u, psi = ca.MX.sym("x", self.n_x), ca.MX.sym("u", self.n_u), ca.MX.sym("psi", self.scenarios.shape[1])
+        x_next = x
+        for _ in range(MODEL_SUBSTEPS):
+            x_next = substep(x_next, u, psi)
+        return ca.Function("step", [x, u, psi], [x_next], {"never_inline": True})
+
+    def _build_solvers(self, compile):
+        """IPOPT twice on the same functions: from scratch, and from a nearby solution with its multipliers."""
+        library = compiled_nlp(self.nlp, self.plant.__name__.split(".")[-1]) if compile else None
+        self.compiled = library is not None
+        common = {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 200}
+        warm = {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
+                "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
+
+        def solver(name, options):
+            return ca.nlpsol(name, "ipopt", str(library) if library else self.nlp, {"ipopt": common | options, "print_time": False})
+
+        self.solvers = {"cold": solver("cold", {}), "warm": solver("warm", warm)}
+        # shift[i]: the entry of w that stands one stage later (under the first scenario, where the tree branches)
+        layout = {(name, t): (start, rows, nodes) for name, t, start, rows, nodes in self.blocks}
+        shift_w = np.arange(self.nlp["x"].numel())
+        shift_g = np.arange(self.nlp["g"].numel())
+        for (name, t), (start, rows, nodes) in layout.items():
+            if (name, t + 1) in layout:
+                shift_w[start : start + rows * nodes] = layout[name, t + 1][0] + np.arange(rows * nodes)
+        sizes = [2 * self.n_x * n for n in self.nodes[1:]]  # dynamics and box of each stage
+        for t in range(self.horizon - 1):
+            a, b, n = sum(sizes[:t]), sum(sizes[: t + 1]), self.n_x * self.nodes[t + 1]
+            shift_g[a : a + n] = b + np.arange(n)
+            shift_g[a + n : a + 2 * n] = b + self.n_x * self.nodes[t + 2] + np.arange(n)
+        self.layout, self.shift_w, self.shift_g = layout, shift_w, shift_g
+
+    def reset(self):
+        """Forget the previous plan, the last action and the counts, as at the start of an episode."""
+        self.u_before = np.zeros(self.n_u)  # the reference's convention for the input-change penalty
+        self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
+        self.guess = None
+        self.stats = {}
+
+    def block(self, w, name, t):
+        """The variables `name` of stage t in w as (rows, nodes), scaled units."""
+        start, rows, nodes = self.layout[name, t]
+        return w[start : start + rows * nodes].reshape(nodes, rows).T
+
+    def _rollout(self, x0, action):
+        """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
+        w = np.zeros(self.nlp["x"].numel())
+        x = np.asarray(x0, dtype=float)[:, None]
+        for t in range(self.horizon):
+            u = np.clip(action(t, x), self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None])
+            parent = self.parent[t + 1]
+            x = np.array(self.step_nodes[self.nodes[t + 1]](x[:, parent], u[:, parent], self.psi[t + 1]))
+            scaled = (x - self.x_center[:, None]) / self.x_scale[:, None]
+            self.block(w, "u", t)[:] = (u - self.u_center[:, None]) / self.u_scale[:, None]
+            self.block(w, "x", t + 1)[:] = scaled
+            self.block(w, "below", t + 1)[:] = np.maximum(-1 - scaled, 0)
+            self.block(w, "above", t + 1)[:] = np.maximum(scaled - 1, 0)
+        return w
+
+    def cold_guess(self, x0):
+        """A plan from nothing: the actor's rollout through the scenarios, or x0 and the middle action held."""
+        if self.actor is not None:
+            return self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+        w = np.zeros(self.nlp["x"].numel())
+        for t in range(1, self.horizon + 1):
+            self.block(w, "x", t)[:] = ((x0 - self.x_center) / self.x_scale)[:, None]
+        return w
+
+    def set_initial_guess(self, x0):
+        """Start the next solve from `cold_guess(x0)`."""
+        self.guess = self.cold_guess(self._checked(x0))
+
+    def _checked(self, x0):
+        x0 = np.asarray(x0, dtype=float)
+        if x0.shape != (self.n_x,):
+            raise ValueError(f"state has shape {x0.shape}; {self.plant.ENV_ID} needs ({self.n_x},): {', '.join(self.plant.STATE_NAMES)}")
+        if not np.isfinite(x0).all():
+            raise ValueError(f"state is {x0}; every entry must be finite")
+        return x0
+
+    def _parameters(self, x0, price):
+        return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel()])
+
+    def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
+        """One call of IPOPT: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
+        bounds = dict(self.bounds, ubx=self.bounds["ubx"].copy())
+        for side, name in enumerate(("below", "above")):
+            for t in range(1, self.horizon + 1):
+                self.block(bounds["ubx"], name, t)[np.isinf(price[side])] = 0.0
+        solver = self.solvers[which]
+        result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **bounds)
+        stats = solver.stats()
+        self.stats["status"] = stats["return_status"]
+        self.stats["iterations"] += stats["iter_count"]
+        if not stats["success"]:
+            return None
+        return tuple(np.array(result[key]).ravel() for key in ("x", "lam_x", "lam_g"))
+
+    def make_step(self, x0):
+        """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
+
+        Ladder: a solve; if it does not succeed one more from a cold guess (with relaxed bounds, if relaxed_price is given);
+        then the next action of the last successful plan; then the actor, or without one the last action. `stats` says which.
+        """
+        x0, tick = self._checked(x0), time.perf_counter()
+        self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
+        cold = self.cold_guess(x0) if self.guess is None else self.guess
+        self.guess, solution = None, None
+        if self.plan is None:
+            solution = self._solve("cold", x0, self.slack_price, cold)
+        else:
+            w, lam_x, lam_g = self.plan
+            shifted = self._rollout(x0, lambda t, x: self.block(w, "u", t) * self.u_scale[:, None] + self.u_center[:, None])
+            parameters = self._parameters(x0, self.slack_price)
+            if self.actor is not None and self.objective(cold, parameters) < self.objective(shifted, parameters):
+                solution = self._solve("cold", x0, self.slack_price, cold)  # the actor's plan is the better start
+            else:
+                solution = self._solve("warm", x0, self.slack_price, shifted, lam_x, lam_g)
+        if solution is None:
+            self.stats |= {"success": False, "rung": "retry"}
+            price = self.slack_price if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
+            solution = self._solve("cold", x0, price, self.cold_guess(x0))
+        if solution is not None:
+            self.last_w = solution[0]
+        elif self.plan is not None:
+            self.stats["rung"] = "plan"
+            solution = self.plan
+        if solution is not None:
+            u = self.block(solution[0], "u", 0)[:, 0] * self.u_scale + self.u_center
+            self.plan = solution[0][self.shift_w], solution[1][self.shift_w], solution[2][self.shift_g]
+        else:
+            self.stats["rung"] = "actor"
+            u = np.array(self.actor(x0, self.goal)).ravel() if self.actor is not None else self.u_before
+        self.u_before = np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
+        self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
+        return self.u_before.copy()
+
+    def prediction(self):
+        """The last successful plan, physical units: lists over stages of states (n_x, nodes) from x_1 on and of actions (n_u, nodes)."""
+        return {
+            "x": [self.block(self.last_w, "x", t + 1) * self.x_scale[:, None] + self.x_center[:, None] for t in range(self.horizon)],
+            "u": [self.block(self.last_w, "u", t) * self.u_scale[:, None] + self.u_center[:, None] for t in range(self.horizon)],
+        }
+
+
+class ActorController:
+    """The learned policy alone, with the interface of ScenarioMPC."""
+
+    def __init__(self, plant, actor, goal):
+        self.plant, self.actor, self.goal = plant, actor, np.array(goal, dtype=float)
+        self.stats = {}
+
+    def reset(self):
+        self.stats = {}
+
+    def set_initial_guess(self, x0):
+        """Nothing to guess."""
+
+    def make_step(self, x0):
+        tick = time.perf_counter()
+        u = np.array(self.actor(x0, self.goal)).ravel()
+        self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
+        return np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
+
+
+class GreedyController(ActorController):
+    """Horizon 0: argmax over u in U of Q(x, u, goal), by L-BFGS-B from the actor's action and the best point of a grid."""
+
+    def __init__(self, plant, actor, Q, goal, points=9):
+        super().__init__(plant, actor, goal)
+        x, v = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("v", len(plant.U_LOW))  # v: action scaled to [0, 1]
+        q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), self.goal)
+        self.negative_q = ca.Function("negative_q", [v, x], [-q, -ca.gradient(q, v)])
+        axes = np.meshgrid(*[np.linspace(0, 1, points)] * len(plant.U_LOW))
+        self.grid = np.stack([a.ravel() for a in axes])  # (n_u, points^n_u)
+
+    def make_step(self, x0):
+        tick = time.perf_counter()
+        x0 = np.asarray(x0, dtype=float)
+        span = self.plant.U_HIGH - self.plant.U_LOW
+        on_grid = np.array(self.negative_q(self.grid, x0)[0]).ravel()
+        starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.grid[:, on_grid.argmin()]]
+
+        def objective(v):
+            value, gradient = self.negative_q(v, x0)
+            return float(value), np.array(gradient).ravel()
+
+        results = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(span)) for start in starts]
+        best = min(results, key=lambda result: result.fun)
+        self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
+        return self.plant.U_LOW + np.clip(best.x, 0, 1) * span
+
+
+@lru_cache(maxsize=None)
+def build_controller(name, args):
+    """One of the compared controllers. Cached, so that a worker process builds it once."""
+    torch.set_num_threads(1)
+    plant = envs.load(args.env)
+    goal = plant.EVAL_GOAL if args.goal is None else np.atleast_1d(args.goal)
+    mu, Q, V = export(load_critic(args.critic, args.env, args.value))
+    if name == "actor":
+        return ActorController(plant, mu, goal)
+    if name == "rl_mpc" and args.horizon == 0:
+        return GreedyController(plant, mu, Q, goal)
+    x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
+    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
+    if name == "rl_mpc":
+        stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * args.sigma**2))])
+        return ScenarioMPC(plant, args.horizon, plant.SCENARIOS["mpc"], stage, ca.Function("terminal", [x, g], [-V(x, g)]),
+                           goal=goal, robust_horizon=args.robust_horizon, actor=mu, compile=args.compile,
+                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf)  # fmt: skip
+    stage = ca.Function("stage", [x, g], [squared_error])
+    return ScenarioMPC(plant, plant.BENCHMARK["horizon"], plant.SCENARIOS["mpc"], stage, goal=goal,
+                       robust_horizon=int(name == "robust_mpc"), slack_price=plant.BENCHMARK["slack_price"], relaxed_price=1e3,
+                       change_weight=plant.BENCHMARK["change_weight"], compile=args.compile)  # fmt: skip
+
+
+# Closed loop
+
+
+def draws(plant, episodes, seed):
+    """Start states (episodes, n_x) uniform in the constraint box and plants (episodes, n_psi) from the evaluation set."""
+    rngs = [np.random.default_rng([seed, i]) for i in range(episodes)]  # episode i does not depend on how many there are
+    return np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs]), np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
+
+
+def run_episode(controller, plant, x0, psi, goal, steps):
+    """Closed loop on a plant with fixed parameters: trajectories x (steps + 1, n_x), u (steps, n_u) and the row of results.csv."""
+    controller.reset()
+    controller.set_initial_guess(x0)
+    x, u, log = [np.asarray(x0, dtype=float)], [], []
+    for _ in range(steps):
+        u.append(controller.make_step(x[-1]))
+        x.append(plant.step(x[-1], u[-1], psi))
+        log.append(controller.stats)
+    x, u = np.array(x), np.array(u)
+    rungs = [s["rung"] for s in log]
+    milliseconds = [s["wall_ms"] for s in log]
+    achieved = x[1:, plant.GOAL_INDEX]
+    outside = np.sum((x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)) ** 2, axis=-1)
+    row = {
+        "time_near_goal": np.exp(-np.sum(plant.goal_error(achieved, goal) ** 2, axis=-1) / (2 * METRIC_SIGMA2)).sum(),
+        "time_outside_constraints": np.sum(np.exp(-outside / (2 * METRIC_SIGMA2)) - 1),
+        "ape_tail": plant.percentage_error(achieved, np.asarray(goal))[-25:].mean(),
+        "solve_ms_median": np.median(milliseconds),
+        "solve_ms_p95": np.quantile(milliseconds, 0.95),
+        "solver_failures": sum(not s["success"] for s in log),
+        "retries": rungs.count("retry"),
+        "fallback_plan": rungs.count("plan"),
+        "fallback_actor": rungs.count("actor"),
+    }
+    return x, u, row
