@@ -268,14 +268,14 @@ class ScenarioMPC:
 
     stage_cost, terminal_cost: CasADi functions (x, goal) -> scalar, to be minimised; terminal_cost may be None.
     scenarios: (S, n_psi); the first is the nominal one. robust_horizon: stages at which the tree branches, 0 = nominal.
-    slack_price: (2, n_x), price per physical unit below X_LOW and above X_HIGH; inf makes the bound hard.
+    slack_price: (2, n_x), price per physical unit below X_LOW and above X_HIGH; inf makes a bound hard, 0 ignores it.
     relaxed_price: if given, an unsuccessful solve is repeated with every bound soft at this price.
     change_weight: (n_u,), price of the squared change of each action, summed over scenarios.
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
-                 relaxed_price=None, change_weight=None, actor=None, compile=True):  # fmt: skip
+                 relaxed_price=None, change_weight=None, actor=None, tol=1e-6, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
@@ -290,7 +290,7 @@ class ScenarioMPC:
         self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
         self._build_tree()
         self._build_problem()
-        self._build_solvers(compile)
+        self._build_solvers(compile, tol)
         self.reset()
 
     def _build_tree(self):
@@ -336,17 +336,22 @@ class ScenarioMPC:
             above = variable("above", t + 1, n_x, n_next, 0.0, np.inf)
             constrain((x_next - self.x_center) / self.x_scale + below - above, -np.ones(n_x), np.ones(n_x))
             slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
-            J += ca.sum2(slack_cost + self.stage_cost.map(n_next)(x_next, ca.repmat(goal, 1, n_next))) / n_next
+            J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost)
             change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
             # not averaged, as in the reference: the first action's change counts once per scenario
             J += n_next / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
             x, u_parent = x_next, u
-        if self.terminal_cost is not None:
-            J += ca.sum2(self.terminal_cost.map(n_next)(x, ca.repmat(goal, 1, n_next))) / n_next
         self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
         self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
         self.step_nodes = {n: step.map(n) for n in set(self.nodes)}
+
+    def node_cost(self, t, x, goal, slack_cost):
+        """Cost of stage t, averaged over its nodes: x (n_x, nodes), goal (n_goal, nodes), slack_cost (1, nodes)."""
+        cost = slack_cost + self.stage_cost.map(x.shape[1])(x, goal)
+        if t == self.horizon and self.terminal_cost is not None:
+            cost += self.terminal_cost.map(x.shape[1])(x, goal)  # at every leaf
+        return ca.sum2(cost) / x.shape[1]
 
     def _model_step(self):
         """Prediction model (x, u, psi) -> x one sampling time later."""
@@ -360,11 +365,12 @@ class ScenarioMPC:
             x_next = substep(x_next, u, psi)
         return ca.Function("step", [x, u, psi], [x_next], {"never_inline": True})
 
-    def _build_solvers(self, compile):
+    def _build_solvers(self, compile, tol):
         """IPOPT twice on the same functions: from scratch, and from a nearby solution with its multipliers."""
         library = compiled_nlp(self.nlp, self.plant.__name__.split(".")[-1]) if compile else None
         self.compiled = library is not None
-        common = {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 200}
+        # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost
+        common = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 200, "bound_relax_factor": 0.0}
         warm = {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                 "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
 
@@ -437,14 +443,25 @@ class ScenarioMPC:
     def _parameters(self, x0, price):
         return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel()])
 
+    def _bounds(self, price):
+        """Bounds of the problem under a slack price: slack is fixed at zero where a bound is hard (inf) or ignored (0)."""
+        bounds = {key: value.copy() for key, value in self.bounds.items()}
+        rows = sum(2 * self.n_x * n for n in self.nodes[1:])
+        for t in range(self.horizon, 0, -1):  # a stage holds the rows of its dynamics, then those of its box
+            nodes = self.nodes[t]
+            for side, (name, bound) in enumerate((("below", "lbg"), ("above", "ubg"))):
+                self.block(bounds["ubx"], name, t)[(price[side] == 0) | np.isinf(price[side])] = 0.0
+                box = bounds[bound][rows - self.n_x * nodes : rows].reshape(nodes, self.n_x)
+                box[:, price[side] == 0] = (-np.inf, np.inf)[side]
+            rows -= 2 * self.n_x * nodes
+        return bounds
+
     def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
         """One call of IPOPT: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
-        bounds = dict(self.bounds, ubx=self.bounds["ubx"].copy())
-        for side, name in enumerate(("below", "above")):
-            for t in range(1, self.horizon + 1):
-                self.block(bounds["ubx"], name, t)[np.isinf(price[side])] = 0.0
+        bounds = self._bounds(price)
         solver = self.solvers[which]
         result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **bounds)
+        self.last_objective = float(result["f"])
         stats = solver.stats()
         self.stats["status"] = stats["return_status"]
         self.stats["iterations"] += stats["iter_count"]
@@ -606,3 +623,180 @@ def run_episode(controller, plant, x0, psi, goal, steps):
         "fallback_actor": rungs.count("actor"),
     }
     return x, u, row
+
+
+def run_job(name, args, episodes):
+    """One controller on some of the paired draws (in a worker process): a list of (episode, x, u, row)."""
+    plant = envs.load(args.env)
+    controller = build_controller(name, args)
+    starts, psi = draws(plant, args.episodes, args.seed)
+    results = []
+    for episode in episodes:
+        x, u, row = run_episode(controller, plant, starts[episode], psi[episode], controller.goal, args.steps)
+        head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0), "critic": args.critic.name,
+                "goal": " ".join(f"{g:g}" for g in controller.goal), "episode": episode, "seed": args.seed,
+                "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
+        results.append((episode, x, u, head | {k: round(float(v), 6) for k, v in row.items()}))
+    return results
+
+
+def compare(args):
+    """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
+    context = multiprocessing.get_context("spawn")  # torch and IPOPT do not survive a fork
+    found = {}
+    with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
+        for _ in pool.map(prepare, args.controllers, [args] * len(args.controllers)):
+            pass  # compile each problem once, before the workers need it
+        slow_first = sorted(args.controllers, key=lambda name: ("actor", "rl_mpc", "nominal_mpc", "robust_mpc").index(name), reverse=True)
+        futures = [pool.submit(run_job, name, args, [i]) for name in slow_first for i in range(args.episodes)]
+        with tqdm(total=len(futures), unit="episode", disable=None) as bar:
+            for future in as_completed(futures):
+                for episode, x, u, row in future.result():
+                    found[row["controller"], episode] = x, u, row
+                bar.update()
+    rows = [found[name, i][2] for name in args.controllers for i in range(args.episodes)]
+    paths = {
+        name: tuple(np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)) for name in args.controllers
+    }
+    return rows, paths
+
+
+def prepare(name, args):
+    build_controller(name, args)
+
+
+# Table and figure
+
+
+LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC", "rl_mpc": "RL+MPC"}
+COLOURS = {"actor": "#D55E00", "nominal_mpc": "#999999", "robust_mpc": "#0072B2", "rl_mpc": "#009E73"}  # Okabe and Ito
+STYLES = {"actor": "--", "nominal_mpc": ":", "robust_mpc": "-.", "rl_mpc": "-"}
+
+
+def label(row):
+    return LABELS[row["controller"]] + (f", N = {row['horizon']}" if row["controller"] != "actor" else "")
+
+
+def table(rows):
+    """The comparison as text: median [worst] over episodes."""
+    lines = [
+        "                        time near goal   time outside    offset     solve ms        first solves       then used",
+        "controller             median [worst]  median [worst]     %      median    p95   that failed    retry  plan  actor",
+    ]
+    for name in dict.fromkeys(row["controller"] for row in rows):
+        mine = [row for row in rows if row["controller"] == name]
+
+        def column(key, mine=mine):
+            return np.array([row[key] for row in mine])
+
+        near, outside = column("time_near_goal"), column("time_outside_constraints")
+        lines.append(
+            f"{label(mine[0]):22s}{np.median(near):7.1f} [{near.min():5.1f}] {np.median(outside):7.1f} [{outside.min():6.1f}]"
+            f" {np.median(column('ape_tail')):6.2f} {np.median(column('solve_ms_median')):9.1f} {np.median(column('solve_ms_p95')):8.1f}"
+            f" {column('solver_failures').sum():11d} {column('retries').sum():10d} {column('fallback_plan').sum():5d} {column('fallback_actor').sum():6d}"
+        )
+    return "\n".join(lines)
+
+
+def figure(plant, args, rows, paths, goal, path, episode=0):
+    """Trajectories of one episode: a panel per state and action, with bounds and goal."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    n_x, n_u = len(plant.X_LOW), len(plant.U_LOW)
+    columns = 3 if n_x + n_u > 4 else 2
+    fig, axes = plt.subplots(-(-(n_x + n_u) // columns), columns, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
+    hours = np.arange(args.steps + 1) * plant.DT
+    names = {row["controller"]: label(row) for row in rows}
+    order = [*[("x", i) for i in range(n_x)], *[("u", i) for i in range(n_u)]]
+    for ax, (kind, i) in zip(axes.T.ravel() if columns == 2 else axes.ravel(), order):
+        for name, (x, u) in paths.items():
+            line = dict(color=COLOURS[name], ls=STYLES[name], lw=1.8, label=names[name])
+            if kind == "x":
+                ax.plot(hours, x[episode, :, i], **line)
+            else:
+                ax.step(hours[:-1], u[episode, :, i], where="post", **line)
+        low, high = (plant.X_LOW, plant.X_HIGH) if kind == "x" else (plant.U_LOW, plant.U_HIGH)
+        for bound in (low[i], high[i]):
+            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
+        if kind == "x" and i in plant.GOAL_INDEX:
+            ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
+        symbols, units = (plant.STATE_NAMES, plant.STATE_UNITS) if kind == "x" else (plant.ACTION_NAMES, plant.ACTION_UNITS)
+        ax.set_title(f"{symbols[i]} [{units[i]}]", fontsize=10)
+    for ax in axes[-1]:
+        ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
+    handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
+    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
+    fig.savefig(path, dpi=150)
+    plt.close(fig)
+
+
+def fail(message):
+    """A user's mistake: one sentence, exit code 2, no traceback."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def check(args):
+    """Refuse arguments that cannot work, before anything long starts; returns plant, goal and critic."""
+    try:
+        plant = envs.load(args.env)
+    except ValueError as error:
+        fail(error)
+    for name, least in dict(horizon=0, robust_horizon=0, episodes=1, steps=1, jobs=1, seed=0).items():
+        if getattr(args, name) < least:
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be at least {least}")
+    for name in ("sigma", "slack_weight"):
+        if not (np.isfinite(getattr(args, name)) and getattr(args, name) > 0):
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be positive and finite")
+    for name in args.controllers:
+        if name not in LABELS:
+            fail(f"--controllers has {name!r}; choose from {', '.join(LABELS)}")
+    if not args.controllers:
+        fail(f"--controllers is empty; choose from {', '.join(LABELS)}")
+    leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
+    if leaves > 1000:
+        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
+    goal = plant.EVAL_GOAL if args.goal is None else np.atleast_1d(args.goal)
+    if goal.shape != plant.EVAL_GOAL.shape or not (np.isfinite(goal) & (plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
+        fail(f"--goal is {args.goal}; it must lie in [{plant.GOAL_LOW[0]:g}, {plant.GOAL_HIGH[0]:g}]")
+    low, high = plant.GOAL_REACHABLE
+    if ((goal < low) | (goal > high)).any():
+        print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)
+    try:
+        critic = load_critic(args.critic, args.env, args.value)
+    except ValueError as error:
+        fail(f"--critic {error}")
+    return plant, goal, critic
+
+
+def main(args):
+    plant, goal, critic = check(args)
+    out = args.out or Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "results.csv").touch()
+    except OSError as error:
+        fail(f"--out {out}: cannot write there ({error.strerror})")
+    try:
+        difference = check_export(critic, export(critic)[2], plant)
+    except RuntimeError as error:
+        fail(error)
+    print(f"{args.critic.name}: CasADi export equals torch to {difference:.0e}; {args.episodes} paired episodes of {args.steps} steps, goal {goal}")
+    tick = time.perf_counter()
+    rows, paths = compare(args)
+    with open(out / "results.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    np.savez_compressed(out / "trajectories.npz", **{f"{name}_{k}": v for name, xu in paths.items() for k, v in zip("xu", xu)})
+    figure(plant, args, rows, paths, goal, out / "episode.png")
+    print(table(rows))
+    print(f"{time.perf_counter() - tick:.0f} s with {args.jobs} processes; {out}/results.csv, trajectories.npz, episode.png")
+    return rows
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

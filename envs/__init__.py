@@ -2,7 +2,7 @@
 
 A plant module holds plain constants and functions and no gymnasium code (`envs/cstr.py` is the pattern to copy):
 
-    ENV_ID, EPISODE_STEPS, DT                     gymnasium id, steps before truncation, sampling time
+    ENV_ID, EPISODE_STEPS, DT, TIME_UNIT          gymnasium id, steps before truncation, sampling time
     STATE_NAMES, STATE_UNITS, ACTION_NAMES, ...   for tables and figures
     X_LOW, X_HIGH                                 constraint box, also the box of initial states, (n_x,)
     OBS_LOW, OBS_HIGH                             wider box that every reachable state stays in, (n_x,)

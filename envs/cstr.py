@@ -12,6 +12,7 @@ from envs import rk4, stack
 ENV_ID = "RLMPC/CSTR-v0"
 EPISODE_STEPS = 50
 DT = 0.005  # h, sampling time
+TIME_UNIT = "h"
 
 STATE_NAMES = ("c_A", "c_B", "T_R", "T_K")
 STATE_UNITS = ("mol/l", "mol/l", "°C", "°C")

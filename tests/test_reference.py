@@ -1,0 +1,97 @@
+"""The optimal control problem under the authors' literal conventions agrees with solutions of their own stack (tests/fixtures)."""
+
+import json
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from envs import cstr
+from rl_mpc_deploy import ScenarioMPC
+
+FIXTURES = Path(__file__).parent / "fixtures"
+SOLUTIONS = {s["mode"]: s for s in json.loads((FIXTURES / "do_mpc_solutions.json").read_text())["solutions"]}
+U_RANGE = cstr.U_HIGH - cstr.U_LOW
+
+
+class LiteralMPC(ScenarioMPC):
+    """do-mpc's conventions: stage cost and constraints at x_0 ... x_{N-1}, slack summed over scenarios; Radau collocation."""
+
+    def node_cost(self, t, x, goal, slack_cost):
+        n = x.shape[1]
+        if t == self.horizon:
+            return ca.sum2(self.terminal_cost.map(n)(x, goal)) / n
+        return ca.sum2(slack_cost) + ca.sum2(self.stage_cost.map(n)(x, goal)) / n
+
+    def _bounds(self, price):
+        bounds = super()._bounds(price)
+        soft = (price > 0) & ~np.isinf(price)  # where the last node's constraint is soft, it is not there
+        rows = self.n_x * self.nodes[-1]
+        for side, (name, bound) in enumerate((("below", "lbg"), ("above", "ubg"))):
+            self.block(bounds["ubx"], name, self.horizon)[soft[side]] = 0.0
+            bounds[bound][-rows:].reshape(-1, self.n_x)[:, soft[side]] = (-np.inf, np.inf)[side]
+        return bounds
+
+    def _model_step(self):
+        """Radau collocation of degree 2, one element, as an implicit function."""
+        tau = ca.collocation_points(2, "radau")
+        C, D, _ = ca.collocation_coeff(tau)
+        x, u, psi = ca.MX.sym("x", 4), ca.MX.sym("u", 2), ca.MX.sym("psi", 2)
+        z = ca.MX.sym("z", 4, 2)  # states at the collocation points, scaled
+        scale = ca.DM(self.x_scale)
+        points = ca.horzcat(x, z * ca.repmat(scale, 1, 2))
+        slopes = ca.horzcat(*[cstr.ode(points[:, j + 1], u, psi, ca) for j in range(2)])
+        residual = (points @ C - self.plant.DT * slopes) / ca.repmat(scale, 1, 2)
+        solver = ca.rootfinder("collocation", "newton", {"x": ca.vec(z), "p": ca.vertcat(x, u, psi), "g": ca.vec(residual)})
+        root = ca.reshape(solver(ca.repmat(x / scale, 2, 1), ca.vertcat(x, u, psi)), 4, 2)
+        return ca.Function("step", [x, u, psi], [ca.horzcat(x, root * ca.repmat(scale, 1, 2)) @ D])
+
+
+def reference_value():
+    """V(x, goal) of the given weights: inputs [x, goal - c_B] unnormalised, actions in units of 10 1/h and 1000 kJ/h."""
+    z = np.load(FIXTURES / "reference_weights.npz")
+    weights = {k: z[k].astype(float) for k in z}
+
+    def dense(name, h):
+        return weights[f"{name}.weight"] @ h + weights[f"{name}.bias"]
+
+    def silu(h):
+        return h / (1 + ca.exp(-h))
+
+    x, goal = ca.MX.sym("x", 4), ca.MX.sym("goal", 1)
+    s = ca.vertcat(x, goal - x[1])
+    mean = dense("actor.fc_mean", silu(dense("actor.fc2", silu(dense("actor.fc1", s)))))
+    a = ca.tanh(mean) * weights["actor.action_scale"].ravel() + weights["actor.action_bias"].ravel()
+    q = dense("value.fc3", silu(dense("value.fc2", silu(dense("value.fc1", ca.vertcat(s, a))))))
+    return ca.Function("V", [x, goal], [q])
+
+
+def solve(mode, cls=LiteralMPC):
+    """First solve of the reference problem, cold; returns controller, objective, first action."""
+    given, S = SOLUTIONS[mode], 1 if mode == "nominal" else 9
+    x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
+    if mode == "nstep_vfmpc":
+        stage = ca.Function("stage", [x, g], [-ca.exp(-((g - x[1]) ** 2) / (2 * 0.1**2))])
+        terminal = ca.Function("terminal", [x, g], [-reference_value()(x, g)])
+        options = dict(slack_price=[[0, 0, 0, 0], [1, 1, 1, 1]])
+    else:
+        stage = terminal = ca.Function("stage", [x, g], [(x[1] - g) ** 2])
+        options = dict(slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"])
+    mpc = cls(cstr, given["n_horizon"], cstr.SCENARIOS["mpc"], stage, terminal, goal=[given["goal"]], robust_horizon=int(S > 1),
+              tol=1e-8, compile=False, **options)  # fmt: skip
+    x0 = np.array(given["x0"])
+    mpc.set_initial_guess(x0)
+    u = mpc.make_step(x0)
+    assert mpc.stats["rung"] == "solved", mpc.stats
+    # the literal sum also holds the constant stage cost of x_0
+    return mpc, mpc.last_objective + float(stage(x0, given["goal"])), u
+
+
+@pytest.mark.parametrize("mode", ["nominal", "baseline", "nstep_vfmpc"])
+def test_literal_variant_agrees_with_the_authors_stack(mode):
+    mpc, objective, u = solve(mode)
+    # IPOPT widened the reference's slack bounds by 1e-8 each: a bonus of price x slacks x 1e-8 that this solver does not take
+    slacks = mpc.horizon * mpc.nodes[-1] * np.array(mpc.slack_price)[np.isfinite(mpc.slack_price)].sum()
+    assert objective == pytest.approx(SOLUTIONS[mode]["objective"] + 1e-8 * slacks, rel=1e-4)
+    assert np.all(np.abs(u - SOLUTIONS[mode]["u0"]) <= 0.01 * U_RANGE), (u, SOLUTIONS[mode]["u0"])
