@@ -77,18 +77,20 @@ class Args:
     """widths of the hidden layers of actor and critics (SiLU)"""
     gamma: float = 0.99
     """discount"""
-    tau: float = 0.005
+    tau: float = 0.02
     """step of the target networks towards the critics after each update"""
     batch_size: int = 256
     """transitions per update"""
-    learning_rate: float = 1e-3
-    """of actor, critics and entropy coefficient (AdamW)"""
-    learning_rate_end: float = 1.0
-    """learning rate at the end of the run, as a share of the initial one (falls linearly)"""
+    learning_rate: float = 3e-3
+    """of actor, critics and entropy coefficient (Adam), at the start"""
+    learning_rate_end: float = 0.0
+    """learning rate at the end of the run, as a share of the initial one (it falls linearly)"""
     learning_starts: int = 1_000
     """transitions with uniformly random actions before the first update"""
-    steps_per_update: int = 4
+    steps_per_update: int = 8
     """transitions collected per update"""
+    entropy_in_target: bool = True
+    """SAC's soft value; off: the critic counts reward alone, the actor still maximises Q plus entropy"""
     buffer_size: int = 200_000
     """transitions that the replay buffer holds"""
     target_entropy: float | None = None
@@ -305,7 +307,7 @@ class SAC:
         self.generator = torch.Generator(device=device).manual_seed(args.seed)
 
         def optimiser(parameters):
-            return torch.optim.AdamW(parameters, lr=args.learning_rate, weight_decay=0.0, fused=True)
+            return torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
 
         self.optimisers = {
             "actor": optimiser(self.actor.parameters()),
@@ -338,7 +340,10 @@ class SAC:
         achieved = x[:, self.scaling.goal_index]
         reward = envs.goal_reward(self.plant, achieved, g, a.smooth_reward, a.reward_sigma2, a.reward_tolerance, xp=torch)
         # the plants do not terminate, and the time limit is bootstrapped through
-        y = reward + a.gamma * (self.target(z, action).amin(0) - self.log_alpha.exp() * log_prob)
+        value = self.target(z, action).amin(0)
+        if a.entropy_in_target:
+            value -= self.log_alpha.exp() * log_prob
+        y = reward + a.gamma * value
         return y.view(batch, k).mean(1)
 
     def update_critic(self, x, u, goal, x_next):
@@ -428,6 +433,11 @@ def save(data, path):
     os.replace(temporary, path)
 
 
+def plain(args):
+    """The arguments as plain data, for files."""
+    return {k: str(v) if isinstance(v, Path) else list(v) if isinstance(v, tuple) else v for k, v in asdict(args).items()}
+
+
 def checkpoint(agent, args, step):
     """What deployment needs, as plain data (loads with weights_only=True)."""
     return {
@@ -471,7 +481,7 @@ def check(args):
     for name in ("learning_starts", "eval_every", "save_every", "seed"):
         if getattr(args, name) < 0:
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must not be negative")
-    for name, low, high in (("her_ratio", 0, 1), ("gamma", 0, 1), ("tau", 0, 1)):
+    for name, low, high in (("her_ratio", 0, 1), ("gamma", 0, 1), ("tau", 0, 1), ("learning_rate_end", 0, 1)):
         if not low <= getattr(args, name) <= high:
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{low}, {high}]")
     for name in ("learning_rate", "reward_sigma2", "reward_tolerance"):
@@ -516,7 +526,7 @@ def main(args):
         fail(f"--out {args.out}: cannot write there ({error.strerror})")
     device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu"))
     torch.set_num_threads(args.torch_threads)
-    plain_args = {k: str(v) if isinstance(v, Path) else list(v) if isinstance(v, tuple) else v for k, v in asdict(args).items()}
+    plain_args = plain(args)
     writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in plain_args.items()))
 
     vec = gym.make_vec(plant.ENV_ID, num_envs=args.num_envs, scenarios=args.scenarios, smooth_reward=args.smooth_reward,

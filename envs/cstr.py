@@ -51,7 +51,7 @@ TRAIN_GOALS = np.array([[0.6], [0.7], [0.8]])
 EVAL_GOAL = np.array([0.65])
 GOAL_LOW, GOAL_HIGH = np.array([0.1]), np.array([2.0])
 GOAL_REACHABLE = (np.array([0.31]), np.array([0.80]))  # at steady state, inside the box, by every scenario of the "mpc" set
-ERROR_SCALE = np.array([0.25])  # mol/l
+ERROR_SCALE = np.array([0.05])  # mol/l; five standard deviations of the training reward
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
 

@@ -1,0 +1,29 @@
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pytest
+import torch
+
+import envs
+import sac_her_branching as training
+
+
+@pytest.fixture(scope="session")
+def plant():
+    return envs.load("cstr")
+
+
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory, plant):
+    """An untrained but not trivial checkpoint.pt, written by the training script's own functions."""
+    args = training.Args(seed=3)
+    agent = training.SAC(args, plant, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:
+            parameter += 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt"
+    training.save(training.checkpoint(agent, training.plain(args), step=0), path)
+    return path
