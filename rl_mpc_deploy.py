@@ -32,7 +32,7 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -263,6 +263,16 @@ def compiled_nlp(nlp, name):
     return library
 
 
+def checked_state(plant, x0):
+    """The measured state as a float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
+    x0 = np.asarray(x0, dtype=float)
+    if x0.shape != plant.X_LOW.shape:
+        raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"state is {x0}; every entry must be finite")
+    return x0
+
+
 class ScenarioMPC:
     """eq:QMPC (with a learned value) or eq:multiMPCobj (without), by multiple shooting over a scenario tree.
 
@@ -302,7 +312,7 @@ class ScenarioMPC:
 
     def _build_problem(self):
         """Variables, constraints and objective of eq:QMPC, stage by stage, scaled so that the box becomes [-1, 1]."""
-        n_x, n_u, plant = self.n_x, self.n_u, self.plant
+        n_x, n_u = self.n_x, self.n_u
         x_now, goal, u_before = ca.MX.sym("x_now", n_x), ca.MX.sym("goal", len(self.goal)), ca.MX.sym("u_before", n_u)
         price = ca.MX.sym("price", n_x, 2)  # of slack below and above
         w, lbw, ubw, J, g, lbg, ubg = [], [], [], 0, [], [], []
@@ -430,15 +440,7 @@ class ScenarioMPC:
 
     def set_initial_guess(self, x0):
         """Start the next solve from `cold_guess(x0)`."""
-        self.guess = self.cold_guess(self._checked(x0))
-
-    def _checked(self, x0):
-        x0 = np.asarray(x0, dtype=float)
-        if x0.shape != (self.n_x,):
-            raise ValueError(f"state has shape {x0.shape}; {self.plant.ENV_ID} needs ({self.n_x},): {', '.join(self.plant.STATE_NAMES)}")
-        if not np.isfinite(x0).all():
-            raise ValueError(f"state is {x0}; every entry must be finite")
-        return x0
+        self.guess = self.cold_guess(checked_state(self.plant, x0))
 
     def _parameters(self, x0, price):
         return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel()])
@@ -475,7 +477,7 @@ class ScenarioMPC:
         Ladder: a solve; if it does not succeed one more from a cold guess (with relaxed bounds, if relaxed_price is given);
         then the next action of the last successful plan; then the actor, or without one the last action. `stats` says which.
         """
-        x0, tick = self._checked(x0), time.perf_counter()
+        x0, tick = checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
         cold = self.cold_guess(x0) if self.guess is None else self.guess
         self.guess, solution = None, None
@@ -530,7 +532,7 @@ class ActorController:
         """Nothing to guess."""
 
     def make_step(self, x0):
-        tick = time.perf_counter()
+        x0, tick = checked_state(self.plant, x0), time.perf_counter()
         u = np.array(self.actor(x0, self.goal)).ravel()
         self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
         return np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
@@ -548,8 +550,7 @@ class GreedyController(ActorController):
         self.grid = np.stack([a.ravel() for a in axes])  # (n_u, points^n_u)
 
     def make_step(self, x0):
-        tick = time.perf_counter()
-        x0 = np.asarray(x0, dtype=float)
+        x0, tick = checked_state(self.plant, x0), time.perf_counter()
         span = self.plant.U_HIGH - self.plant.U_LOW
         on_grid = np.array(self.negative_q(self.grid, x0)[0]).ravel()
         starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.grid[:, on_grid.argmin()]]
@@ -564,7 +565,7 @@ class GreedyController(ActorController):
         return self.plant.U_LOW + np.clip(best.x, 0, 1) * span
 
 
-@lru_cache(maxsize=None)
+@cache
 def build_controller(name, args):
     """One of the compared controllers. Cached, so that a worker process builds it once."""
     torch.set_num_threads(1)
@@ -636,7 +637,7 @@ def run_job(name, args, episodes):
         head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0), "critic": args.critic.name,
                 "goal": " ".join(f"{g:g}" for g in controller.goal), "episode": episode, "seed": args.seed,
                 "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
-        results.append((episode, x, u, head | {k: round(float(v), 6) for k, v in row.items()}))
+        results.append((episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}))
     return results
 
 
@@ -655,9 +656,7 @@ def compare(args):
                     found[row["controller"], episode] = x, u, row
                 bar.update()
     rows = [found[name, i][2] for name in args.controllers for i in range(args.episodes)]
-    paths = {
-        name: tuple(np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)) for name in args.controllers
-    }
+    paths = {name: tuple(np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)) for name in args.controllers}
     return rows, paths
 
 
@@ -680,21 +679,17 @@ def label(row):
 def table(rows):
     """The comparison as text: median [worst] over episodes."""
     lines = [
-        "                        time near goal   time outside    offset     solve ms        first solves       then used",
-        "controller             median [worst]  median [worst]     %      median    p95   that failed    retry  plan  actor",
+        "                        time near goal    time outside    offset      solve ms        failed  of these solved by",
+        "controller              median [worst]  median [worst]       %  median      p95   solves  retry   plan   actor",
     ]
     for name in dict.fromkeys(row["controller"] for row in rows):
-        mine = [row for row in rows if row["controller"] == name]
-
-        def column(key, mine=mine):
-            return np.array([row[key] for row in mine])
-
-        near, outside = column("time_near_goal"), column("time_outside_constraints")
-        lines.append(
-            f"{label(mine[0]):22s}{np.median(near):7.1f} [{near.min():5.1f}] {np.median(outside):7.1f} [{outside.min():6.1f}]"
-            f" {np.median(column('ape_tail')):6.2f} {np.median(column('solve_ms_median')):9.1f} {np.median(column('solve_ms_p95')):8.1f}"
-            f" {column('solver_failures').sum():11d} {column('retries').sum():10d} {column('fallback_plan').sum():5d} {column('fallback_actor').sum():6d}"
-        )
+        mine = {key: np.array([row[key] for row in rows if row["controller"] == name]) for key in rows[0]}
+        title = label({key: column[0] for key, column in mine.items()})
+        median = {key: np.median(column) for key, column in mine.items() if column.dtype.kind == "f"}
+        near, outside = (f"{median[key]:6.1f} [{mine[key].min():5.1f}]" for key in ("time_near_goal", "time_outside_constraints"))
+        failed, *rungs = (mine[key].sum() for key in ("solver_failures", "retries", "fallback_plan", "fallback_actor"))
+        times = f"{median['solve_ms_median']:6.1f}  {median['solve_ms_p95']:7.1f}"
+        lines.append(f"{title:22s}  {near}  {outside}  {median['ape_tail']:6.2f}  {times}  {failed:7d}" + "".join(f"{n:7d}" for n in rungs))
     return "\n".join(lines)
 
 
@@ -784,7 +779,7 @@ def main(args):
         difference = check_export(critic, export(critic)[2], plant)
     except RuntimeError as error:
         fail(error)
-    print(f"{args.critic.name}: CasADi export equals torch to {difference:.0e}; {args.episodes} paired episodes of {args.steps} steps, goal {goal}")
+    print(f"{args.critic.name}: the CasADi export equals torch to {difference:.0e}")
     tick = time.perf_counter()
     rows, paths = compare(args)
     with open(out / "results.csv", "w", newline="") as file:

@@ -25,7 +25,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -504,8 +504,7 @@ def load_resume(path, given):
             raise KeyError("format")
     except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
         fail(f"--resume {path}: not a resume.pt of this script ({type(error).__name__})")
-    types = {f.name: f.type for f in fields(Args)}
-    stored = {k: tuple(v) if k == "hidden" else Path(v) if types[k] in (Path, Path | None) and v else v for k, v in state["args"].items()}
+    stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
     args = Args(**stored)
     args.total_timesteps = max(args.total_timesteps, given.total_timesteps)
     return args, state
@@ -613,7 +612,7 @@ def main(args):
         raise SystemExit(130)
     last = rows[-1]
     print(f"""
-{plant.ENV_ID}, {args.scenarios} scenarios, seed {args.seed}: {step} transitions, {updates} updates, {seconds:.0f} s, {step / seconds:.0f} steps/s
+{plant.ENV_ID}, {args.scenarios} scenarios, seed {args.seed}: {step} transitions, {updates} updates in {seconds:.0f} s
 absolute percentage error, goal {plant.EVAL_GOAL}   median   75th percentile
   robust evaluation, all plants      {last["robust_median_ape"]:10.2f} {last["robust_p75_ape"]:12.2f}
   robust evaluation, held-out plants {last["robust_held_out_median_ape"]:10.2f}

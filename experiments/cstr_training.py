@@ -67,7 +67,8 @@ def train(scenarios, seed, args):
     done = list(parent.glob("*/wall_seconds.txt"))
     if done:
         return done[0].parent
-    command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--seed", str(seed), "--scenarios", scenarios, "--out", str(parent)]
+    command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--scenarios", scenarios, "--seed", str(seed)]
+    command += ["--out", str(parent)]
     if args.quick:
         command += ["--total-timesteps", "3000", "--eval-every", "1000"]
     tick = time.perf_counter()
@@ -112,9 +113,10 @@ def plot(args):
             mine = [row for row in curves if row["scenarios"] == scenarios]
             steps = sorted({int(row["step"]) for row in mine})
             values = np.array([[float(row[f"{evaluation}_median_ape"]) for row in mine if int(row["step"]) == step] for step in steps])
+            steps = np.array(steps) / 1000
             ax.plot(steps, iqm(values), color=colour, lw=2, ls="-" if scenarios == "robust" else "--", label=f"{scenarios} agent")
             ax.fill_between(steps, values.min(1), values.max(1), color=colour, alpha=0.2, lw=0)
-        ax.set(yscale="log", xlabel="transitions", title=f"{evaluation} evaluation")
+        ax.set(yscale="log", xlabel="transitions [thousands]", title=f"{evaluation} evaluation")
         ax.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("median absolute percentage error of $c_B$")
