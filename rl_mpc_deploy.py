@@ -79,8 +79,8 @@ class Args:
     """price of a constraint violation, per physical unit (mol/l, degC) and step"""
     constraints: Literal["soft", "hard"] = "soft"
     """hard: the paper's variant that gets stuck or infeasible"""
-    value: Literal["min", "first", "mean"] = "min"
-    """which of the twin critics the terminal value takes"""
+    value: Literal["min", "first", "mean"] = "first"
+    """which of the twin critics V takes; their minimum has kinks, where the solver stalls"""
     controllers: tuple[str, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
     """which controllers to compare"""
     compile: bool = True

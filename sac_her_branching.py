@@ -40,6 +40,8 @@ from tqdm import tqdm
 
 import envs
 
+CONSTRAINT_SIGMA2 = 0.01  # physical units squared, of the paper's time outside constraints
+
 
 @dataclass
 class Args:
@@ -70,6 +72,8 @@ class Args:
     """sigma^2 of the Gaussian reward, squared units of the goal; default: the plant's (cstr: 1e-4)"""
     reward_tolerance: float | None = None
     """half-width of the 0/1 reward, units of the goal; default: the plant's (cstr: 0.01)"""
+    constraint_weight: float = 0.0
+    """weight of the measure of time outside constraints, exp(-|x - clip(x)|^2 / 0.02) - 1, in the reward; 0: the paper's agent"""
     goal_input: Literal["error", "goal"] = "error"
     """what the networks see beside the state: goal minus achieved goal, or the goal itself"""
 
@@ -103,7 +107,7 @@ class Args:
     save_every: int = 50_000
     """transitions between checkpoints; 0: only at the end"""
     resume: Path | None = None
-    """a resume.pt: continue that run in its folder, with its arguments (only --total-timesteps may be raised)"""
+    """a resume.pt: continue that run in its folder, with the arguments that it was started with"""
     out: Path = Path("runs")
     """folder that the run's own folder is made in"""
 
@@ -339,6 +343,9 @@ class SAC:
         action, log_prob = self.actor.sample(z, self.generator)
         achieved = x[:, self.scaling.goal_index]
         reward = envs.goal_reward(self.plant, achieved, g, a.smooth_reward, a.reward_sigma2, a.reward_tolerance, xp=torch)
+        if a.constraint_weight:  # so that a planner cannot put a violation off to after its horizon, where it would be free
+            outside = F.relu(z[:, : x.shape[1]].abs() - 1) * self.scaling.x_scale  # distance to the box, which is [-1, 1] in z
+            reward = reward + a.constraint_weight * (torch.exp(-(outside**2).sum(-1) / (2 * CONSTRAINT_SIGMA2)) - 1)
         # the plants do not terminate, and the time limit is bootstrapped through
         value = self.target(z, action).amin(0)
         if a.entropy_in_target:
@@ -478,8 +485,8 @@ def check(args):
     for name in ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"):
         if getattr(args, name) < 1:
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be at least 1")
-    for name in ("learning_starts", "eval_every", "save_every", "seed"):
-        if getattr(args, name) < 0:
+    for name in ("learning_starts", "eval_every", "save_every", "seed", "constraint_weight"):
+        if not getattr(args, name) >= 0:
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must not be negative")
     for name, low, high in (("her_ratio", 0, 1), ("gamma", 0, 1), ("tau", 0, 1), ("learning_rate_end", 0, 1)):
         if not low <= getattr(args, name) <= high:
@@ -496,8 +503,8 @@ def check(args):
     return plant
 
 
-def load_resume(path, given):
-    """Arguments and state of an interrupted run; of the arguments given now, only total_timesteps is taken."""
+def load_resume(path):
+    """Arguments and state of an interrupted run."""
     try:
         state = torch.load(path, weights_only=True, map_location="cpu")
         if state["format"] != "rlmpc-resume-1":
@@ -505,16 +512,14 @@ def load_resume(path, given):
     except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
         fail(f"--resume {path}: not a resume.pt of this script ({type(error).__name__})")
     stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
-    args = Args(**stored)
-    args.total_timesteps = max(args.total_timesteps, given.total_timesteps)
-    return args, state
+    return Args(**stored), state
 
 
 def main(args):
     state = None
     if args.resume:
         run_dir = args.resume.parent
-        args, state = load_resume(args.resume, args)
+        args, state = load_resume(args.resume)
     plant = check(args)
     if state is None:
         run_dir = args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"

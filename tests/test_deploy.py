@@ -43,6 +43,11 @@ def first_solve(controller, x0=X0):
     return controller.last_objective, u
 
 
+def close(u, v, share):
+    """Actions that differ by at most this share of their range."""
+    return (np.abs(u - v) <= share * (cstr.U_HIGH - cstr.U_LOW)).all()
+
+
 # Checkpoint and export
 
 
@@ -92,7 +97,7 @@ def test_identical_scenarios_give_the_nominal_controller():
     one = first_solve(mpc(scenarios=cstr.PSI_NOMINAL[None]))
     for objective, u in (same, one):
         assert objective == pytest.approx(nominal[0], rel=1e-5)
-        np.testing.assert_allclose(u, nominal[1], atol=1e-3 * np.ptp([cstr.U_LOW, cstr.U_HIGH], axis=0))
+        assert close(u, nominal[1], 1e-3)
 
 
 @pytest.mark.parametrize("robust_horizon", [1, 2])
@@ -127,22 +132,22 @@ def test_constraints_hold_at_every_predicted_state_the_last_included():
     """Without a reward, only the slack price of the last state can stop a controller that is paid to heat the reactor."""
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
     heat = ca.Function("heat", [x, g], [-x[2] / 10])
-    hot = np.array([0.8, 0.6, 136.0, 139.0])
-    free = mpc(2, stage=heat, slack_price=0.0)
+    hot = np.array([1.2, 0.6, 137.0, 137.0])
+    free = mpc(3, stage=heat, slack_price=0.0)
     first_solve(free, hot)
-    assert max(states[2].max() for states in free.prediction()["x"]) > 140.5
+    assert max(states[2].max() for states in free.prediction()["x"]) > 145
     for options in (dict(slack_price=10.0), dict(slack_price=np.inf)):
-        controller = mpc(2, stage=heat, **options)
+        controller = mpc(3, stage=heat, **options)
         first_solve(controller, hot)
         for states in controller.prediction()["x"]:
             assert states[2].max() < 140 + 1e-3 and states[3].max() < 140 + 1e-3
 
 
 def test_soft_equals_hard_where_hard_is_feasible():
-    objective_soft, u_soft = first_solve(mpc(slack_price=1e3))
+    objective_soft, u_soft = first_solve(mpc(slack_price=10.0))
     objective_hard, u_hard = first_solve(mpc(slack_price=np.inf))
     assert objective_soft == pytest.approx(objective_hard, rel=1e-4)
-    np.testing.assert_allclose(u_soft, u_hard, atol=0.01 * np.ptp([cstr.U_LOW, cstr.U_HIGH], axis=0))
+    assert close(u_soft, u_hard, 0.01)
 
 
 def test_slack_is_priced_per_physical_unit():

@@ -1,0 +1,55 @@
+"""Every experiment runs on a tiny budget and writes finite numbers; every committed figure can be redrawn from its CSV."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXPERIMENTS = {
+    "cstr_training": ["cstr_training.csv", "cstr_training_seeds.csv"],
+    "cstr_deploy": ["cstr_deploy.csv"],
+    "cstr_profile": ["cstr_profile.csv"],
+}
+TEXT = {"env", "scenarios", "machine", "controller", "critic", "psi"}
+
+
+def run(name, *arguments):
+    command = [sys.executable, f"experiments/{name}.py", *map(str, arguments)]
+    out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert out.returncode == 0, out.stderr
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_quick_run(name, tmp_path):
+    keep = ["--runs", tmp_path / "runs"] if name != "cstr_profile" else []
+    run(name, "--quick", "--out", tmp_path, *keep)
+    assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
+    for table in EXPERIMENTS[name]:
+        rows = list(csv.DictReader(open(tmp_path / "results" / table)))
+        committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
+        assert rows and list(rows[0]) == list(committed[0])
+        for row in rows + committed:
+            assert all(np.isfinite(float(value)) for key, value in row.items() if key not in TEXT)
+            assert "psi" not in row or len(json.loads(row["psi"])) == 2
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_figures_are_drawn_from_the_committed_tables(name, tmp_path):
+    shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
+    run(name, "--plot-only", "--out", tmp_path)
+    assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_shipped_critics_are_the_first_seed_of_the_committed_table():
+    """experiments/pretrained/*.txt quotes the table; the table's first seed is the default command."""
+    table = list(csv.DictReader(open(ROOT / "experiments/results/cstr_training_seeds.csv")))
+    for scenarios in ("robust", "nominal"):
+        row = next(row for row in table if row["scenarios"] == scenarios and row["seed"] == "0")
+        text = (ROOT / f"experiments/pretrained/cstr_{scenarios}.txt").read_text()
+        assert f"{float(row['robust_median_ape']):.2f} %" in text and f"{float(row['nominal_median_ape']):.2f} %" in text
