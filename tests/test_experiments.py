@@ -16,7 +16,7 @@ EXPERIMENTS = {
     "cstr_deploy": ["cstr_deploy.csv"],
     "cstr_profile": ["cstr_profile.csv"],
 }
-TEXT = {"env", "scenarios", "machine", "controller", "critic", "psi"}
+TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi"}
 
 
 def run(name, *arguments):
