@@ -236,14 +236,12 @@ def check_export(critic, V, plant, points=64, tolerance=1e-8):
 
 
 def compiled_nlp(nlp, name):
-    """Path of a shared object with the functions of an NLP and their derivatives; None where there is no C compiler.
+    """Path of a shared object with the functions of an NLP and their derivatives; None, and a notice, where compiling fails.
 
-    The file is kept in a cache folder under a hash of its source and the compiler, and appears there by an atomic rename, so
-    that parallel processes may race for it.
+    The file is kept in a cache folder under a hash of its source, compiler and machine, and appears there by an atomic rename,
+    so that parallel processes may race for it.
     """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-    if compiler is None:
-        return None
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), "no C compiler")
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rlmpc"
     with tempfile.TemporaryDirectory() as folder:
         previous = os.getcwd()
@@ -253,13 +251,17 @@ def compiled_nlp(nlp, name):
         finally:
             os.chdir(previous)
         source = Path(folder) / "nlp.c"
-        key = hashlib.sha256(source.read_bytes() + f"{compiler} {COMPILER_FLAGS} {platform.processor()}".encode()).hexdigest()[:24]
+        key = hashlib.sha256(source.read_bytes() + f"{compiler} {COMPILER_FLAGS} {platform.node()}".encode()).hexdigest()[:24]
         library = cache / f"{name}-{key}.so"
         if not library.exists():
-            cache.mkdir(parents=True, exist_ok=True)
             built = cache / f"{library.name}.{os.getpid()}"
-            subprocess.run([compiler, *COMPILER_FLAGS, str(source), "-o", str(built), "-lm"], check=True, capture_output=True)
-            os.replace(built, library)
+            try:
+                cache.mkdir(parents=True, exist_ok=True)
+                subprocess.run([compiler, *COMPILER_FLAGS, str(source), "-o", str(built), "-lm"], check=True, capture_output=True)
+                os.replace(built, library)
+            except (OSError, subprocess.CalledProcessError) as error:
+                print(f"notice: running interpreted, some five times slower: cannot compile ({error})", file=sys.stderr)
+                return None
     return library
 
 
@@ -316,20 +318,21 @@ class ScenarioMPC:
         x_now, goal, u_before = ca.MX.sym("x_now", n_x), ca.MX.sym("goal", len(self.goal)), ca.MX.sym("u_before", n_u)
         price = ca.MX.sym("price", n_x, 2)  # of slack below and above
         w, lbw, ubw, J, g, lbg, ubg = [], [], [], 0, [], [], []
-        self.blocks = []  # (name, stage, first index into w, rows, nodes)
+        self.layout = {}  # (name, stage): first index into w or g, rows, nodes
         step = self._model_step()
 
         def variable(name, t, rows, nodes, low, high):
-            self.blocks.append((name, t, sum(v.numel() for v in w), rows, nodes))
+            self.layout[name, t] = sum(v.numel() for v in w), rows, nodes
             w.append(ca.MX.sym(f"{name}_{t}", rows, nodes))
             lbw.append(np.full(rows * nodes, low))
             ubw.append(np.full(rows * nodes, high))
             return w[-1]
 
-        def constrain(expression, low, high):
+        def constrain(name, t, expression, low, high):
+            self.layout[name, t] = sum(v.numel() for v in g), *expression.shape
             g.append(expression)
-            lbg.append(np.tile(low, expression.shape[1]))
-            ubg.append(np.tile(high, expression.shape[1]))
+            lbg.append(np.full(expression.numel(), low))
+            ubg.append(np.full(expression.numel(), high))
 
         x, u_parent = x_now, u_before  # physical units, one column per node
         for t in range(self.horizon):
@@ -340,11 +343,11 @@ class ScenarioMPC:
             x_next = variable("x", t + 1, n_x, n_next, -np.inf, np.inf) * self.x_scale + self.x_center
             parent = self.parent[t + 1].tolist()
             predicted = step.map(n_next)(x[:, parent], u[:, parent], self.psi[t + 1])
-            constrain((predicted - x_next) / self.x_scale, np.zeros(n_x), np.zeros(n_x))
+            constrain("dynamics", t + 1, (predicted - x_next) / self.x_scale, 0.0, 0.0)
             # X_LOW <= x_{t+1} + below - above <= X_HIGH, slack >= 0; a hard bound is a slack fixed at zero
             below = variable("below", t + 1, n_x, n_next, 0.0, np.inf)
             above = variable("above", t + 1, n_x, n_next, 0.0, np.inf)
-            constrain((x_next - self.x_center) / self.x_scale + below - above, -np.ones(n_x), np.ones(n_x))
+            constrain("box", t + 1, (x_next - self.x_center) / self.x_scale + below - above, -1.0, 1.0)
             slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
             J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost)
             change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
@@ -384,23 +387,16 @@ class ScenarioMPC:
         warm = {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                 "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
 
-        def solver(name, options):
-            return ca.nlpsol(name, "ipopt", str(library) if library else self.nlp, {"ipopt": common | options, "print_time": False})
-
-        self.solvers = {"cold": solver("cold", {}), "warm": solver("warm", warm)}
-        # shift[i]: the entry of w that stands one stage later (under the first scenario, where the tree branches)
-        layout = {(name, t): (start, rows, nodes) for name, t, start, rows, nodes in self.blocks}
-        shift_w = np.arange(self.nlp["x"].numel())
-        shift_g = np.arange(self.nlp["g"].numel())
-        for (name, t), (start, rows, nodes) in layout.items():
-            if (name, t + 1) in layout:
-                shift_w[start : start + rows * nodes] = layout[name, t + 1][0] + np.arange(rows * nodes)
-        sizes = [2 * self.n_x * n for n in self.nodes[1:]]  # dynamics and box of each stage
-        for t in range(self.horizon - 1):
-            a, b, n = sum(sizes[:t]), sum(sizes[: t + 1]), self.n_x * self.nodes[t + 1]
-            shift_g[a : a + n] = b + np.arange(n)
-            shift_g[a + n : a + 2 * n] = b + self.n_x * self.nodes[t + 2] + np.arange(n)
-        self.layout, self.shift_w, self.shift_g = layout, shift_w, shift_g
+        options = {"print_time": False, "show_eval_warnings": False}
+        self.solvers = {
+            name: ca.nlpsol(name, "ipopt", str(library or "") or self.nlp, options | {"ipopt": common | more})
+            for name, more in (("cold", {}), ("warm", warm))
+        }
+        self.shift_w, self.shift_g = np.arange(self.nlp["x"].numel()), np.arange(self.nlp["g"].numel())
+        for (name, t), (start, rows, nodes) in self.layout.items():
+            if (name, t + 1) in self.layout:  # one stage later; under the first scenario, where the tree branches
+                shift = self.shift_g if name in ("dynamics", "box") else self.shift_w
+                shift[start : start + rows * nodes] = self.layout[name, t + 1][0] + np.arange(rows * nodes)
 
     def reset(self):
         """Forget the previous plan, the last action and the counts, as at the start of an episode."""
@@ -410,7 +406,7 @@ class ScenarioMPC:
         self.stats = {}
 
     def block(self, w, name, t):
-        """The variables `name` of stage t in w as (rows, nodes), scaled units."""
+        """A view (rows, nodes) of the variables or constraints `name` of stage t in a vector like w or g, scaled units."""
         start, rows, nodes = self.layout[name, t]
         return w[start : start + rows * nodes].reshape(nodes, rows).T
 
@@ -448,21 +444,16 @@ class ScenarioMPC:
     def _bounds(self, price):
         """Bounds of the problem under a slack price: slack is fixed at zero where a bound is hard (inf) or ignored (0)."""
         bounds = {key: value.copy() for key, value in self.bounds.items()}
-        rows = sum(2 * self.n_x * n for n in self.nodes[1:])
-        for t in range(self.horizon, 0, -1):  # a stage holds the rows of its dynamics, then those of its box
-            nodes = self.nodes[t]
-            for side, (name, bound) in enumerate((("below", "lbg"), ("above", "ubg"))):
-                self.block(bounds["ubx"], name, t)[(price[side] == 0) | np.isinf(price[side])] = 0.0
-                box = bounds[bound][rows - self.n_x * nodes : rows].reshape(nodes, self.n_x)
-                box[:, price[side] == 0] = (-np.inf, np.inf)[side]
-            rows -= 2 * self.n_x * nodes
+        for t in range(1, self.horizon + 1):
+            for name, bound, no_bound, p in (("below", "lbg", -np.inf, price[0]), ("above", "ubg", np.inf, price[1])):
+                self.block(bounds["ubx"], name, t)[(p == 0) | np.isinf(p)] = 0.0
+                self.block(bounds[bound], "box", t)[p == 0] = no_bound
         return bounds
 
     def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
         """One call of IPOPT: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
-        bounds = self._bounds(price)
         solver = self.solvers[which]
-        result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **bounds)
+        result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **self._bounds(price))
         self.last_objective = float(result["f"])
         stats = solver.stats()
         self.stats["status"] = stats["return_status"]
@@ -626,42 +617,35 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     return x, u, row
 
 
-def run_job(name, args, episodes):
-    """One controller on some of the paired draws (in a worker process): a list of (episode, x, u, row)."""
-    plant = envs.load(args.env)
+def run_job(name, args, episode):
+    """One controller on one of the paired draws, in a worker process: name, episode, x, u and the row of results.csv."""
     controller = build_controller(name, args)
-    starts, psi = draws(plant, args.episodes, args.seed)
-    results = []
-    for episode in episodes:
-        x, u, row = run_episode(controller, plant, starts[episode], psi[episode], controller.goal, args.steps)
-        head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0), "critic": args.critic.name,
-                "goal": " ".join(f"{g:g}" for g in controller.goal), "episode": episode, "seed": args.seed,
-                "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
-        results.append((episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}))
-    return results
+    starts, psi = draws(controller.plant, episode + 1, args.seed)
+    x, u, row = run_episode(controller, controller.plant, starts[episode], psi[episode], controller.goal, args.steps)
+    head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0), "critic": args.critic.name,
+            "goal": " ".join(f"{g:g}" for g in controller.goal), "episode": episode, "seed": args.seed,
+            "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
+    return name, episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}
+
+
+def prepare(name, args):
+    """Have a controller compiled before the workers need it."""
+    build_controller(name, args)
 
 
 def compare(args):
     """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
-    context = multiprocessing.get_context("spawn")  # torch and IPOPT do not survive a fork
-    found = {}
-    with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
-        for _ in pool.map(prepare, args.controllers, [args] * len(args.controllers)):
-            pass  # compile each problem once, before the workers need it
-        slow_first = sorted(args.controllers, key=lambda name: ("actor", "rl_mpc", "nominal_mpc", "robust_mpc").index(name), reverse=True)
-        futures = [pool.submit(run_job, name, args, [i]) for name in slow_first for i in range(args.episodes)]
-        with tqdm(total=len(futures), unit="episode", disable=None) as bar:
-            for future in as_completed(futures):
-                for episode, x, u, row in future.result():
-                    found[row["controller"], episode] = x, u, row
-                bar.update()
-    rows = [found[name, i][2] for name in args.controllers for i in range(args.episodes)]
-    paths = {name: tuple(np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)) for name in args.controllers}
+    names, found = dict.fromkeys(args.controllers), {}
+    with ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:  # torch does not survive a fork
+        list(pool.map(prepare, names, [args] * len(names)))
+        slow_first = sorted(names, key=("robust_mpc", "nominal_mpc", "rl_mpc", "actor").index)
+        futures = [pool.submit(run_job, name, args, i) for name in slow_first for i in range(args.episodes)]
+        for future in tqdm(as_completed(futures), total=len(futures), unit="episode", disable=None):
+            name, episode, *result = future.result()
+            found[name, episode] = result
+    rows = [found[name, i][2] for name in names for i in range(args.episodes)]
+    paths = {name: [np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)] for name in names}
     return rows, paths
-
-
-def prepare(name, args):
-    build_controller(name, args)
 
 
 # Table and figure

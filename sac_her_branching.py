@@ -118,20 +118,19 @@ class Args:
 class Scaling:
     """Affine maps between physical and network units, kept in the checkpoint as plain lists."""
 
-    def __init__(self, x_center, x_scale, goal_center, goal_scale, error_scale, u_center, u_scale, goal_index, device="cpu"):
-        self.values = dict(x_center=x_center, x_scale=x_scale, goal_center=goal_center, goal_scale=goal_scale,
-                           error_scale=error_scale, u_center=u_center, u_scale=u_scale, goal_index=goal_index)  # fmt: skip
-        for name, value in self.values.items():
+    def __init__(self, device="cpu", **values):
+        self.values = values
+        for name, value in values.items():
             setattr(self, name, torch.tensor(value, device=device, dtype=torch.long if name == "goal_index" else torch.float32))
 
     @classmethod
     def of(cls, plant, device="cpu"):
-        def affine(low, high):
-            return ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+        def affine(name, low, high):
+            return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": ((high - low) / 2).tolist()}
 
-        goal = affine(plant.X_LOW[plant.GOAL_INDEX], plant.X_HIGH[plant.GOAL_INDEX])
-        return cls(*affine(plant.X_LOW, plant.X_HIGH), *goal, plant.ERROR_SCALE.tolist(), *affine(plant.U_LOW, plant.U_HIGH),
-                   plant.GOAL_INDEX, device)  # fmt: skip
+        i, goals = plant.GOAL_INDEX, affine("goal", plant.X_LOW[plant.GOAL_INDEX], plant.X_HIGH[plant.GOAL_INDEX])
+        return cls(device, **affine("x", plant.X_LOW, plant.X_HIGH), **affine("u", plant.U_LOW, plant.U_HIGH), **goals,
+                   error_scale=plant.ERROR_SCALE.tolist(), goal_index=i)  # fmt: skip
 
     def features(self, x, goal, goal_input):
         """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_x + n_goal)."""
@@ -211,7 +210,7 @@ class Policy:
 
     @torch.no_grad()
     def value(self, x, goal):
-        """V(x, goal) = min_j Q_j(x, mu(x, goal), goal), (B,). SAC's value: it contains the entropy bonus."""
+        """V(x, goal) = min_j Q_j(x, mu(x, goal), goal), (B,). It contains SAC's entropy bonus unless trained without."""
         z = self._features(x, goal)
         return self.critic(z, self.actor.act(z)).amin(0).cpu().numpy()
 
@@ -223,14 +222,14 @@ def load_policy(path, device="cpu"):
     actor, critic = Actor(**data["network"]).to(device), TwinCritic(**data["network"]).to(device)
     actor.load_state_dict(data["actor"])
     critic.load_state_dict(data["critic"])
-    return Policy(plant, actor, critic, Scaling(**data["scaling"], device=device), data["goal_input"])
+    return Policy(plant, actor, critic, Scaling(device, **data["scaling"]), data["goal_input"])
 
 
 # Replay with hindsight
 
 
 class HERBuffer:
-    """Ring buffer of whole episodes of parallel plants; goals are replaced when a batch is drawn.
+    """Ring buffer of the parallel plants' transitions, episode after episode; goals are replaced when a batch is drawn.
 
     Row t % rows holds time t of every plant. Example with `future`: an episode covers t = 100 ... 149 and the sample is
     t = 120; the hindsight goal is what x_{t'+1} achieved for t' uniform in 120 ... 149, so that at least one t' is rewarded.
@@ -285,8 +284,7 @@ class HERBuffer:
         return {k: v for k, v in vars(self).items() if torch.is_tensor(v)} | {"now": self.now}
 
     def load_state_dict(self, state):
-        for name, value in state.items():
-            setattr(self, name, value)
+        vars(self).update(state)
 
 
 # Soft actor-critic
@@ -310,19 +308,9 @@ class SAC:
         self.target_entropy = -float(n_u) if args.target_entropy is None else args.target_entropy
         self.generator = torch.Generator(device=device).manual_seed(args.seed)
 
-        def optimiser(parameters):
-            return torch.optim.Adam(parameters, lr=args.learning_rate, fused=True)
-
-        self.optimisers = {
-            "actor": optimiser(self.actor.parameters()),
-            "critic": optimiser(self.critic.parameters()),
-            "alpha": optimiser([self.log_alpha]),
-        }
+        trained = {"actor": self.actor.parameters(), "critic": self.critic.parameters(), "alpha": [self.log_alpha]}
+        self.optimisers = {name: torch.optim.Adam(p, lr=args.learning_rate, fused=True) for name, p in trained.items()}
         self.policy = Policy(plant, self.actor, self.critic, self.scaling, args.goal_input)
-
-    def set_learning_rate(self, learning_rate):
-        for optimiser in self.optimisers.values():
-            optimiser.param_groups[0]["lr"] = learning_rate
 
     def features(self, x, goal):
         return self.scaling.features(x, goal, self.args.goal_input)
@@ -354,7 +342,7 @@ class SAC:
         return y.view(batch, k).mean(1)
 
     def update_critic(self, x, u, goal, x_next):
-        """One step of both critics; returns (loss, mean Q, mean target)."""
+        """One step of both critics; returns what to log."""
         with torch.no_grad():
             y = self.targets(goal, x_next)
         q = self.critic(self.features(x, goal), (u - self.scaling.u_center) / self.scaling.u_scale)
@@ -364,10 +352,10 @@ class SAC:
         self.optimisers["critic"].step()
         with torch.no_grad():
             torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), self.args.tau)
-        return loss.detach(), q.detach().mean(), y.mean()
+        return {"losses/qf_loss": loss.detach(), "losses/qf_values": q.detach().mean(), "losses/targets": y.mean()}
 
     def update_actor(self, x, goal):
-        """One step of the actor and the entropy coefficient; returns (actor loss, alpha, entropy)."""
+        """One step of the actor and the entropy coefficient; returns what to log."""
         z = self.features(x, goal)
         action, log_prob = self.actor.sample(z, self.generator)
         alpha = self.log_alpha.detach().exp()
@@ -378,7 +366,7 @@ class SAC:
         entropy = -log_prob.detach().mean()
         self.log_alpha.grad = alpha * (entropy - self.target_entropy)  # of exp(log_alpha) * (entropy - target_entropy)
         self.optimisers["alpha"].step()
-        return loss.detach(), alpha, entropy
+        return {"losses/actor_loss": loss.detach(), "losses/alpha": alpha, "losses/entropy": entropy}
 
     def state_dict(self):
         modules = {name: getattr(self, name).state_dict() for name in ("actor", "critic", "target")}
@@ -403,7 +391,7 @@ def evaluate(policy, goal, episodes, seed, robust, steps=50, tail=25):
     Robust: psi drawn per episode from the plant's evaluation set and held; otherwise the nominal plant. Returns the mean
     absolute percentage error of each episode (episodes,) and whether its plant is held out from the training grid (episodes,).
     """
-    plant, rng = policy.plant, np.random.default_rng(seed)
+    plant, rng = policy.plant, np.random.default_rng([seed, 1])  # a stream of its own: training starts come from [seed]
     x = envs.sample_states(plant, rng, episodes)
     psi = rng.choice(plant.EVAL_PSI, size=episodes)
     if not robust:
@@ -421,13 +409,10 @@ def evaluation_row(policy, episodes, seed):
     """Medians and 75th percentiles that evaluations.csv and tensorboard report, in percent."""
     robust, held_out = evaluate(policy, policy.plant.EVAL_GOAL, episodes, seed, robust=True)
     nominal, _ = evaluate(policy, policy.plant.EVAL_GOAL, episodes, seed, robust=False)
-    return {
-        "robust_median_ape": float(np.median(robust)),
-        "robust_p75_ape": float(np.quantile(robust, 0.75)),
-        "robust_held_out_median_ape": float(np.median(robust[held_out])) if held_out.any() else float("nan"),
-        "nominal_median_ape": float(np.median(nominal)),
-        "nominal_p75_ape": float(np.quantile(nominal, 0.75)),
-    }
+    row = {"robust_median_ape": np.median(robust), "robust_p75_ape": np.quantile(robust, 0.75),
+           "robust_held_out_median_ape": np.median(robust[held_out]) if held_out.any() else np.nan,
+           "nominal_median_ape": np.median(nominal), "nominal_p75_ape": np.quantile(nominal, 0.75)}  # fmt: skip
+    return {name: float(value) for name, value in row.items()}
 
 
 def save(data, path):
@@ -482,18 +467,18 @@ def check(args):
         plant = envs.load(args.env)
     except ValueError as error:
         fail(error)
-    for name in ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"):
-        if getattr(args, name) < 1:
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be at least 1")
-    for name in ("learning_starts", "eval_every", "save_every", "seed", "constraint_weight"):
-        if not getattr(args, name) >= 0:
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must not be negative")
-    for name, low, high in (("her_ratio", 0, 1), ("gamma", 0, 1), ("tau", 0, 1), ("learning_rate_end", 0, 1)):
-        if not low <= getattr(args, name) <= high:
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{low}, {high}]")
-    for name in ("learning_rate", "reward_sigma2", "reward_tolerance"):
-        if getattr(args, name) is not None and not getattr(args, name) > 0:
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be positive")
+    ranges = {
+        (1, 10**9): ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"),
+        (0, 10**9): ("seed", "learning_starts", "eval_every", "save_every", "constraint_weight"),
+        (0, 1): ("her_ratio", "gamma", "tau", "learning_rate_end"),
+        (1e-9, 1e3): ("learning_rate", "reward_sigma2", "reward_tolerance"),
+        (-1e3, 1e3): ("target_entropy",),
+    }
+    for (low, high), names in ranges.items():
+        for name in names:
+            value = getattr(args, name)
+            if value is not None and not low <= value <= high:  # catches nan too
+                fail(f"--{name.replace('_', '-')} is {value}; it must lie in [{low:g}, {high:g}]")
     if not args.hidden or min(args.hidden) < 1:
         fail(f"--hidden is {args.hidden}; it needs at least one width, each at least 1")
     if args.buffer_size < args.num_envs:
@@ -508,27 +493,30 @@ def load_resume(path):
     try:
         state = torch.load(path, weights_only=True, map_location="cpu")
         if state["format"] != "rlmpc-resume-1":
-            raise KeyError("format")
+            raise ValueError
+        stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
+        return Args(**stored), state
     except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
         fail(f"--resume {path}: not a resume.pt of this script ({type(error).__name__})")
-    stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
-    return Args(**stored), state
 
 
 def main(args):
-    state = None
+    state, run_dir = None, None
     if args.resume:
         run_dir = args.resume.parent
+        if args != Args(resume=args.resume):
+            fail(f"--resume {args.resume} continues with the arguments that the run was started with; give no others")
         args, state = load_resume(args.resume)
     plant = check(args)
-    if state is None:
-        run_dir = args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
+    run_dir = run_dir or args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
+        run_dir.mkdir(parents=True, exist_ok=state is not None)
         writer = SummaryWriter(run_dir, purge_step=state["step"] if state else None)
     except OSError as error:
-        fail(f"--out {args.out}: cannot write there ({error.strerror})")
-    device = torch.device("cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu"))
+        fail(f"--out {args.out}: cannot write {run_dir} there ({error.strerror})")
+    device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
+    if state and state["device"] != device.type:
+        fail(f"--resume {run_dir / 'resume.pt'} was written on {state['device']}; its random state cannot continue on {device.type}")
     torch.set_num_threads(args.torch_threads)
     plain_args = plain(args)
     writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in plain_args.items()))
@@ -539,7 +527,7 @@ def main(args):
     agent = SAC(args, plant, device)
     buffer = HERBuffer(args.buffer_size, args.num_envs, len(plant.X_LOW), len(plant.U_LOW), len(plant.GOAL_INDEX),
                        plant.GOAL_INDEX, args.branches, args.her_strategy, args.her_ratio, device)  # fmt: skip
-    rng = np.random.default_rng(args.seed)  # random actions before learning starts
+    rng = np.random.default_rng([args.seed, 2])  # random actions before learning starts
     obs, _ = vec.reset(seed=args.seed)
     returns, finished, step, updates, seconds, rows = np.zeros(args.num_envs), [], 0, 0, 0.0, []
     if state:
@@ -552,9 +540,9 @@ def main(args):
 
     def save_all():
         save(checkpoint(agent, plain_args, step), run_dir / "checkpoint.pt")
-        resume = {"format": "rlmpc-resume-1", "args": plain_args, "agent": agent.state_dict(), "buffer": buffer.state_dict(),
-                  "vec": vec.get_state(), "rng": rng.bit_generator.state, "returns": returns.tolist(), "finished": finished,
-                  "step": step, "updates": updates, "seconds": seconds, "rows": rows}  # fmt: skip
+        resume = {"format": "rlmpc-resume-1", "device": device.type, "args": plain_args, "agent": agent.state_dict(),
+                  "buffer": buffer.state_dict(), "vec": vec.get_state(), "rng": rng.bit_generator.state, "returns": returns.tolist(),
+                  "finished": finished, "step": step, "updates": updates, "seconds": seconds, "rows": rows}  # fmt: skip
         save(resume, run_dir / "resume.pt")
 
     def due(every):
@@ -564,7 +552,7 @@ def main(args):
         for name, value in scalars.items():
             writer.add_scalar(name, value, step)
 
-    interrupted = []  # Ctrl-C is acted on between steps, where the state is whole; a second one kills
+    losses, interrupted = {}, []  # Ctrl-C is acted on between steps, where the state is whole; a second one kills
     previous_handler = signal.signal(signal.SIGINT, lambda *_: (interrupted.append(True), signal.signal(signal.SIGINT, signal.SIG_DFL)))
     bar = tqdm(total=args.total_timesteps, initial=step, unit="step", mininterval=0.5, disable=None)
     try:
@@ -586,19 +574,17 @@ def main(args):
                 finished = returns[done].tolist()
                 returns[done] = 0
             if step >= args.learning_starts:
-                agent.set_learning_rate(args.learning_rate * (1 + (args.learning_rate_end - 1) * step / args.total_timesteps))
+                progress = min(step / args.total_timesteps, 1.0)
+                for optimiser in agent.optimisers.values():
+                    optimiser.param_groups[0]["lr"] = args.learning_rate * (1 + (args.learning_rate_end - 1) * progress)
                 while updates * args.steps_per_update < step - args.learning_starts:
                     x, u, goal, x_next = buffer.sample(args.batch_size, agent.generator)
-                    critic_loss, q, y = agent.update_critic(x, u, goal, x_next)
-                    actor_loss, alpha, entropy = agent.update_actor(x, goal)
+                    losses = agent.update_critic(x, u, goal, x_next) | agent.update_actor(x, goal)
                     updates += 1
             seconds += time.perf_counter() - tick
             bar.update(args.num_envs)
-            if due(1_000) and updates:
-                log({"losses/qf_loss": critic_loss, "losses/qf_values": q, "losses/targets": y, "losses/actor_loss": actor_loss,
-                     "losses/alpha": alpha, "losses/entropy": entropy, "charts/SPS": step / seconds})  # fmt: skip
-                if finished:
-                    log({"charts/episodic_return": np.mean(finished)})
+            if due(1_000):
+                log(losses | {"charts/SPS": step / seconds} | ({"charts/episodic_return": np.mean(finished)} if finished else {}))
             if due(args.eval_every) or step >= args.total_timesteps:
                 row = evaluation_row(agent.policy, args.eval_episodes, seed=args.seed)
                 log({f"eval/{name}": value for name, value in row.items()})

@@ -83,11 +83,9 @@ def plot(args):
     rows = read(args.out / "results/cstr_deploy.csv")
     columns = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
     fig, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
+    print(f"{'':33s}{'time near goal':>27s}{'time outside constraints':>39s}{'offset':>9s}{'solve ms':>16s}{'failed':>9s}")
     print(
-        "                                   time near goal                time outside constraints            offset    solve ms      failed"
-    )
-    print(
-        "                                   median  5 %-ile    worst      median  5 %-ile    worst     mean   median  median    p95   solves"
+        f"{'':33s}{'median  5 %-ile    worst':>27s}{'median  5 %-ile    worst     mean':>39s}{'%':>9s}{'median     p95':>16s}{'solves':>9s}"
     )
     for position, variant in enumerate(VARIANTS):
         mine = {key: np.array([row[key] for row in rows if row["variant"] == variant]) for key in rows[0]}

@@ -98,7 +98,7 @@ def collect(args):
 
 
 def iqm(values, axis=-1):
-    """Interquartile mean: the mean without the lowest and the highest quarter."""
+    """Interquartile mean, computed as rliable does: without the lowest and the highest quarter, rounded down to whole seeds."""
     return trim_mean(values, 0.25, axis=axis)
 
 

@@ -183,14 +183,16 @@ def test_compiled_equals_interpreted(monkeypatch, tmp_path):
 
 def test_shifting_moves_time_and_not_channels():
     controller = mpc(4, cstr.SCENARIOS["mpc"][:2])
-    w = np.zeros(controller.nlp["x"].numel())
-    for (name, t), (_, rows, nodes) in controller.layout.items():
-        controller.block(w, name, t)[:] = 1000 * t + 10 * np.arange(rows)[:, None] + np.arange(nodes)
-    shifted = w[controller.shift_w]
-    for (name, t), (_, rows, nodes) in controller.layout.items():
-        later = t + 1 if (name, t + 1) in controller.layout else t
-        expected = 1000 * later + 10 * np.arange(rows)[:, None] + np.arange(nodes)
-        np.testing.assert_array_equal(controller.block(shifted, name, t), expected)
+    w, g = np.zeros(controller.nlp["x"].numel()), np.zeros(controller.nlp["g"].numel())
+    for vector, shift, names in ((w, controller.shift_w, ("u", "x", "below", "above")), (g, controller.shift_g, ("dynamics", "box"))):
+        layout = {key: block for key, block in controller.layout.items() if key[0] in names}
+        for (name, t), (_, rows, nodes) in layout.items():
+            controller.block(vector, name, t)[:] = 1000 * t + 10 * np.arange(rows)[:, None] + np.arange(nodes)
+        shifted = vector[shift]
+        for (name, t), (_, rows, nodes) in layout.items():
+            later = t + 1 if (name, t + 1) in layout else t
+            expected = 1000 * later + 10 * np.arange(rows)[:, None] + np.arange(nodes)
+            np.testing.assert_array_equal(controller.block(shifted, name, t), expected)
 
 
 # Failures

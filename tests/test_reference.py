@@ -27,10 +27,9 @@ class LiteralMPC(ScenarioMPC):
     def _bounds(self, price):
         bounds = super()._bounds(price)
         soft = (price > 0) & ~np.isinf(price)  # where the last node's constraint is soft, it is not there
-        rows = self.n_x * self.nodes[-1]
-        for side, (name, bound) in enumerate((("below", "lbg"), ("above", "ubg"))):
-            self.block(bounds["ubx"], name, self.horizon)[soft[side]] = 0.0
-            bounds[bound][-rows:].reshape(-1, self.n_x)[:, soft[side]] = (-np.inf, np.inf)[side]
+        for name, bound, no_bound, p in (("below", "lbg", -np.inf, soft[0]), ("above", "ubg", np.inf, soft[1])):
+            self.block(bounds["ubx"], name, self.horizon)[p] = 0.0
+            self.block(bounds[bound], "box", self.horizon)[p] = no_bound
         return bounds
 
     def _model_step(self):

@@ -77,13 +77,15 @@ def test_branches_share_one_goal_and_stay_with_their_transition():
 # Updates
 
 
-@pytest.mark.parametrize("entropy_in_target", [True, False])
-def test_branched_target_is_the_mean_of_single_targets(plant, entropy_in_target):
+@pytest.mark.parametrize("entropy_in_target, constraint_weight", [(True, 0.0), (False, 2.0)])
+def test_branched_target_is_the_mean_of_single_targets(plant, entropy_in_target, constraint_weight):
     """eq:robustQ sample by sample: reward and minimum inside the mean, one sampled action per branch."""
-    args = training.Args(branches=3, entropy_in_target=entropy_in_target)
+    args = training.Args(branches=3, entropy_in_target=entropy_in_target, constraint_weight=constraint_weight)
     agent = training.SAC(args, plant, CPU)
     rng = np.random.default_rng(0)
-    x_next = torch.tensor(envs.sample_states(plant, rng, 15).reshape(5, 3, 4), dtype=torch.float32)
+    states = envs.sample_states(plant, rng, 15) + rng.normal(size=(15, 4)) * [0.1, 0.1, 0.0, 0.0]
+    states[::2, 2] = 140.0 + rng.uniform(0, 0.2, size=8)  # some a little outside the box
+    x_next = torch.tensor(states.reshape(5, 3, 4), dtype=torch.float32)
     goal = x_next[:, 0, [1]] + 0.01
     state = agent.generator.get_state()
     y = agent.targets(goal, x_next)
@@ -95,9 +97,11 @@ def test_branched_target_is_the_mean_of_single_targets(plant, entropy_in_target)
         for i in range(3):
             j = 3 * b + i
             reward = np.exp(-((x_next[b, i, 1] - goal[b, 0]).item() ** 2) / (2 * 1e-4))
+            outside = x_next[b, i].numpy() - np.clip(x_next[b, i].numpy(), plant.X_LOW, plant.X_HIGH)
+            reward += constraint_weight * (np.exp(-np.sum(outside**2) / (2 * 0.01)) - 1)
             q = min(agent.target(z[[j]], actions[[j]])[:, 0].tolist())
             total += reward + args.gamma * (q - entropy_in_target * agent.log_alpha.exp().item() * log_probs[j].item())
-        assert y[b].item() == pytest.approx(total / 3, rel=1e-4)
+        assert y[b].item() == pytest.approx(total / 3, rel=1e-3)
 
 
 def test_twin_critic_is_two_plain_networks(plant):
@@ -156,7 +160,7 @@ def test_evaluate_is_the_papers_protocol(plant):
             return np.tile([10.0, 0.0], (len(x), 1))
 
     errors, held_out = training.evaluate(Constant(), np.array([0.65]), episodes=6, seed=5, robust=True)
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng([5, 1])
     starts, psi = envs.sample_states(plant, rng, 6), rng.choice(plant.EVAL_PSI, size=6)
     for i in range(6):
         x, c_b = starts[i], []
@@ -248,13 +252,14 @@ def test_command_line_end_to_end(tmp_path):
     [
         (["--env", "reactor"], ["--env", "reactor", "cstr"]),
         (["--env", "../cstr"], ["--env"]),
-        (["--total-timesteps", "0"], ["--total-timesteps", "0", "at least 1"]),
+        (["--total-timesteps", "0"], ["--total-timesteps", "0", "[1, "]),
         (["--gamma", "1.5"], ["--gamma", "1.5", "[0, 1]"]),
         (["--gamma", "nan"], ["--gamma", "nan"]),
-        (["--learning-rate", "-1"], ["--learning-rate", "positive"]),
+        (["--learning-rate", "inf"], ["--learning-rate", "inf"]),
         (["--branches", "0"], ["--branches"]),
         (["--resume", "no/such/resume.pt"], ["--resume", "no/such/resume.pt"]),
         (["--resume", "README.md"], ["--resume", "README.md"]),
+        (["--resume", "README.md", "--seed", "1"], ["--resume", "no others"]),
         (["--out", "README.md/runs"], ["--out", "cannot write"]),
         (["--scenarios", "all"], ["scenarios", "robust"]),
     ],
