@@ -19,6 +19,7 @@ It writes `runs/{env}__rl_mpc_deploy__{seed}__{time}/`: results.csv (a row per c
 episode.png. Only the folder `envs/` is needed beside this file, and a checkpoint.
 """
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -58,8 +59,8 @@ class Args:
     """the plant: NAME of a module envs/NAME.py; must be the one that the critic was trained on"""
     horizon: int = 5
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
-    critic: Path = Path(__file__).parent / "experiments/pretrained/cstr_robust.pt"
-    """a checkpoint.pt of sac_her_branching.py"""
+    critic: Path | None = None
+    """a checkpoint.pt of sac_her_branching.py; default: experiments/pretrained/{env}_robust.pt"""
     goal: float | None = None
     """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
     episodes: int = 4
@@ -72,16 +73,16 @@ class Args:
     """processes; the results do not depend on it, but for the times"""
 
     robust_horizon: int = 1
-    """stages at which the scenario tree branches; 0: the nominal model alone"""
+    """RL+MPC: stages at which the scenario tree branches; 0: the nominal model alone"""
     sigma: float = 0.1
-    """width of the Gaussian stage cost, units of the goal (the paper's text says 0.25, its script 0.1)"""
+    """RL+MPC: width of the Gaussian stage cost, units of the goal (the paper's text says 0.25, its script 0.1)"""
     slack_weight: float = 1.0
-    """price of a constraint violation, per physical unit (mol/l, degC) and step"""
+    """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step"""
     constraints: Literal["soft", "hard"] = "soft"
-    """hard: the paper's variant that gets stuck or infeasible"""
+    """RL+MPC: hard is the paper's variant that gets stuck or infeasible"""
     value: Literal["min", "first", "mean"] = "first"
     """which of the twin critics V takes; their minimum has kinks, where the solver stalls"""
-    controllers: tuple[str, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
+    controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "rl_mpc"], ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
     """which controllers to compare"""
     compile: bool = True
     """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc)"""
@@ -144,8 +145,8 @@ class Critic:
 
     COMBINE = {"min": lambda q: q.amin(0), "first": lambda q: q[0], "mean": lambda q: q.mean(0)}
 
-    def __init__(self, data, value="min"):
-        self.data, self.combine = data, value
+    def __init__(self, data, value):
+        self.data, self.combine, self.goal_input = data, value, data["goal_input"]
         self.actor, self.critic = Actor(**data["network"]).double(), TwinCritic(**data["network"]).double()
         self.actor.load_state_dict(data["actor"])
         self.critic.load_state_dict(data["critic"])
@@ -153,26 +154,25 @@ class Critic:
 
     def value(self, x, goal):
         """V(x, g) = Q(x, mu(x, g), g) in torch, (B, n_x) and (B, n_goal) -> (B,)."""
-        z = self.scaling.features(x, goal, self.data["goal_input"])
+        z = self.scaling.features(x, goal, self.goal_input)
         return self.COMBINE[self.combine](self.critic(z, self.actor.act(z)))
 
 
-def load_critic(path, env=None, value="min"):
+def load_critic(path, env, value="first"):
     """The actor and critic stored in a checkpoint.pt. Raises ValueError, one sentence, for anything else."""
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
+        if data["format"] != "rlmpc-sac-her-branching-1":
+            raise KeyError
+        if data["env"] != env:
+            raise ValueError(f"{path} was trained on {data['env']!r}, not on {env!r}; --env and --critic must match")
+        critic = Critic(data, value)
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist; it must be a checkpoint.pt written by sac_her_branching.py") from None
-    except Exception as error:  # a text file, a truncated file, a folder, a pickle of code: torch raises many types
-        raise ValueError(f"{path} is not a readable checkpoint of sac_her_branching.py ({type(error).__name__})") from None
-    if not isinstance(data, dict) or data.get("format") != "rlmpc-sac-her-branching-1":
-        raise ValueError(f"{path} is a torch file, but not a checkpoint.pt of sac_her_branching.py")
-    if env is not None and data["env"] != env:
-        raise ValueError(f"{path} was trained on {data['env']!r}, not on {env!r}; --env and --critic must match")
-    try:
-        critic = Critic(data, value)
-    except (RuntimeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} has weights that do not fit its own description ({type(error).__name__})") from None
+    except ValueError:
+        raise
+    except Exception as error:  # text, a truncated file, a folder, a pickle of code, weights that do not fit: torch raises many types
+        raise ValueError(f"{path} is not a checkpoint.pt of sac_her_branching.py ({type(error).__name__})") from None
     if not all(p.isfinite().all() for p in [*critic.actor.parameters(), *critic.critic.parameters()]):
         raise ValueError(f"{path} has weights that are not finite")
     return critic
@@ -198,7 +198,7 @@ def export(critic):
     n_x, n_goal, n_u = len(scaling["x_center"]), len(scaling["goal_center"]), net["n_u"]
     x, goal, u = ca.MX.sym("x", n_x), ca.MX.sym("goal", n_goal), ca.MX.sym("u", n_u)
     achieved = x[critic.scaling.goal_index.tolist()]
-    if critic.data["goal_input"] == "error":
+    if critic.goal_input == "error":
         g = (goal - achieved) / scaling["error_scale"]
     else:
         g = (goal - scaling["goal_center"]) / scaling["goal_scale"]
@@ -235,34 +235,35 @@ def check_export(critic, V, plant, points=64, tolerance=1e-8):
 # Scenario MPC
 
 
-def compiled_nlp(nlp, name):
-    """Path of a shared object with the functions of an NLP and their derivatives; None, and a notice, where compiling fails.
+def compiled_solver(nlp, options):
+    """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
 
-    The file is kept in a cache folder under a hash of its source, compiler and machine, and appears there by an atomic rename,
-    so that parallel processes may race for it.
+    The C code of the problem and its derivatives is compiled once and kept in a cache folder under a hash of source, compiler
+    and processor; it appears there by an atomic rename, so that parallel processes may race for it. Where anything of that
+    fails (no compiler, no place to write, a library that does not load), a notice is printed and None returned.
     """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), "no C compiler")
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rlmpc"
-    with tempfile.TemporaryDirectory() as folder:
-        previous = os.getcwd()
-        os.chdir(folder)  # CasADi writes the source into the current folder
-        try:
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
+    try:
+        if compiler is None:
+            raise OSError("no gcc, clang or cc")
+        version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
+        cpu = Path("/proc/cpuinfo")
+        processor = cpu.read_text().split("\n\n")[0].split("flags")[-1] if cpu.exists() else platform.processor()
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
             ca.nlpsol("nlp", "ipopt", nlp).generate_dependencies("nlp.c")
-        finally:
-            os.chdir(previous)
-        source = Path(folder) / "nlp.c"
-        key = hashlib.sha256(source.read_bytes() + f"{compiler} {COMPILER_FLAGS} {platform.node()}".encode()).hexdigest()[:24]
-        library = cache / f"{name}-{key}.so"
-        if not library.exists():
-            built = cache / f"{library.name}.{os.getpid()}"
-            try:
+            source = Path("nlp.c").read_bytes()
+            key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
+            library = cache / f"{key}.so"
+            if not library.exists():
                 cache.mkdir(parents=True, exist_ok=True)
-                subprocess.run([compiler, *COMPILER_FLAGS, str(source), "-o", str(built), "-lm"], check=True, capture_output=True)
+                built = cache / f"{key}.{os.getpid()}"
+                subprocess.run([compiler, *COMPILER_FLAGS, "nlp.c", "-o", str(built), "-lm"], check=True, capture_output=True)
                 os.replace(built, library)
-            except (OSError, subprocess.CalledProcessError) as error:
-                print(f"notice: running interpreted, some five times slower: cannot compile ({error})", file=sys.stderr)
-                return None
-    return library
+        return {name: ca.nlpsol(name, "ipopt", str(library), options(name)) for name in ("cold", "warm")}
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        print(f"notice: running interpreted, three to six times slower ({error})", file=sys.stderr)
+        return None
 
 
 def checked_state(plant, x0):
@@ -351,8 +352,8 @@ class ScenarioMPC:
             slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
             J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost)
             change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
-            # not averaged, as in the reference: the first action's change counts once per scenario
-            J += n_next / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
+            # not averaged, as in the reference: every action's change counts once for each scenario that passes through its node
+            J += self.nodes[-1] / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
             x, u_parent = x_next, u
         self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
@@ -380,18 +381,18 @@ class ScenarioMPC:
 
     def _build_solvers(self, compile, tol):
         """IPOPT twice on the same functions: from scratch, and from a nearby solution with its multipliers."""
-        library = compiled_nlp(self.nlp, self.plant.__name__.split(".")[-1]) if compile else None
-        self.compiled = library is not None
         # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost
         common = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 200, "bound_relax_factor": 0.0}
         warm = {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                 "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
 
-        options = {"print_time": False, "show_eval_warnings": False}
-        self.solvers = {
-            name: ca.nlpsol(name, "ipopt", str(library or "") or self.nlp, options | {"ipopt": common | more})
-            for name, more in (("cold", {}), ("warm", warm))
-        }
+        def options(name):
+            return {"ipopt": common | (warm if name == "warm" else {}), "print_time": False, "show_eval_warnings": False}
+
+        self.solvers = compiled_solver(self.nlp, options) if compile else None
+        self.compiled = self.solvers is not None
+        if not self.compiled:
+            self.solvers = {name: ca.nlpsol(name, "ipopt", self.nlp, options(name)) for name in ("cold", "warm")}
         self.shift_w, self.shift_g = np.arange(self.nlp["x"].numel()), np.arange(self.nlp["g"].numel())
         for (name, t), (start, rows, nodes) in self.layout.items():
             if (name, t + 1) in self.layout:  # one stage later; under the first scenario, where the tree branches
@@ -402,13 +403,19 @@ class ScenarioMPC:
         """Forget the previous plan, the last action and the counts, as at the start of an episode."""
         self.u_before = np.zeros(self.n_u)  # the reference's convention for the input-change penalty
         self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
-        self.guess = None
+        self.plan_left = 0  # actions that it still holds
+        self.last_w = None
         self.stats = {}
 
     def block(self, w, name, t):
         """A view (rows, nodes) of the variables or constraints `name` of stage t in a vector like w or g, scaled units."""
         start, rows, nodes = self.layout[name, t]
         return w[start : start + rows * nodes].reshape(nodes, rows).T
+
+    def physical(self, w, name, t):
+        """States ("x") or actions ("u") of stage t in w, physical units, (rows, nodes)."""
+        center, scale = (self.x_center, self.x_scale) if name == "x" else (self.u_center, self.u_scale)
+        return self.block(w, name, t) * scale[:, None] + center[:, None]
 
     def _rollout(self, x0, action):
         """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
@@ -425,18 +432,21 @@ class ScenarioMPC:
             self.block(w, "above", t + 1)[:] = np.maximum(scaled - 1, 0)
         return w
 
-    def cold_guess(self, x0):
-        """A plan from nothing: the actor's rollout through the scenarios, or x0 and the middle action held."""
-        if self.actor is not None:
-            return self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+    def hold_guess(self, x0):
+        """The start state held at every node, with the middle action."""
         w = np.zeros(self.nlp["x"].numel())
         for t in range(1, self.horizon + 1):
             self.block(w, "x", t)[:] = ((x0 - self.x_center) / self.x_scale)[:, None]
         return w
 
+    def cold_guess(self, x0):
+        """A plan from nothing: the actor's rollout through the scenarios, or without an actor `hold_guess`."""
+        return self.hold_guess(x0) if self.actor is None else self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+
     def set_initial_guess(self, x0):
-        """Start the next solve from `cold_guess(x0)`."""
-        self.guess = self.cold_guess(checked_state(self.plant, x0))
+        """Forget the previous plan: the next solve starts from `cold_guess`."""
+        checked_state(self.plant, x0)
+        self.plan, self.plan_left = None, 0
 
     def _parameters(self, x0, price):
         return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel()])
@@ -465,37 +475,36 @@ class ScenarioMPC:
     def make_step(self, x0):
         """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
 
-        Ladder: a solve; if it does not succeed one more from a cold guess (with relaxed bounds, if relaxed_price is given);
-        then the next action of the last successful plan; then the actor, or without one the last action. `stats` says which.
+        Ladder: a solve, from the shifted previous plan or from the actor's rollout, whichever costs less; if it does not succeed,
+        one more from a cold guess that was not tried yet (with relaxed bounds, if relaxed_price is given); then the next action
+        of the last successful plan, while it lasts; then the actor, or without one the last action. `stats` says which.
         """
         x0, tick = checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
-        cold = self.cold_guess(x0) if self.guess is None else self.guess
-        self.guess, solution = None, None
-        if self.plan is None:
-            solution = self._solve("cold", x0, self.slack_price, cold)
-        else:
-            w, lam_x, lam_g = self.plan
-            shifted = self._rollout(x0, lambda t, x: self.block(w, "u", t) * self.u_scale[:, None] + self.u_center[:, None])
-            parameters = self._parameters(x0, self.slack_price)
-            if self.actor is not None and self.objective(cold, parameters) < self.objective(shifted, parameters):
-                solution = self._solve("cold", x0, self.slack_price, cold)  # the actor's plan is the better start
-            else:
-                solution = self._solve("warm", x0, self.slack_price, shifted, lam_x, lam_g)
+        cold, start, multipliers = self.cold_guess(x0), "cold", ()
+        if self.plan is not None:
+            w, *multipliers = self.plan
+            shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
+            parameters = self._parameters(x0, np.minimum(self.slack_price, 1e3))  # a hard bound is dear in this comparison
+            if self.actor is None or self.objective(shifted, parameters) <= self.objective(cold, parameters):
+                start = "warm"
+        solution = self._solve(start, x0, self.slack_price, *((shifted, *multipliers) if start == "warm" else (cold,)))
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
-            price = self.slack_price if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
-            solution = self._solve("cold", x0, price, self.cold_guess(x0))
+            if self.relaxed_price is not None:
+                solution = self._solve("cold", x0, np.full((2, self.n_x), self.relaxed_price), cold)
+            else:
+                solution = self._solve("cold", x0, self.slack_price, cold if start == "warm" else self.hold_guess(x0))
         if solution is not None:
-            self.last_w = solution[0]
-        elif self.plan is not None:
-            self.stats["rung"] = "plan"
-            solution = self.plan
+            self.last_w, self.plan_left = solution[0], self.horizon
+        elif self.plan_left > 0:
+            self.stats["rung"], solution = "plan", self.plan
         if solution is not None:
-            u = self.block(solution[0], "u", 0)[:, 0] * self.u_scale + self.u_center
+            u = self.physical(solution[0], "u", 0)[:, 0]
             self.plan = solution[0][self.shift_w], solution[1][self.shift_w], solution[2][self.shift_g]
+            self.plan_left -= 1
         else:
-            self.stats["rung"] = "actor"
+            self.stats["rung"], self.plan = "actor", None
             u = np.array(self.actor(x0, self.goal)).ravel() if self.actor is not None else self.u_before
         self.u_before = np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
         self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
@@ -503,10 +512,10 @@ class ScenarioMPC:
 
     def prediction(self):
         """The last successful plan, physical units: lists over stages of states (n_x, nodes) from x_1 on and of actions (n_u, nodes)."""
-        return {
-            "x": [self.block(self.last_w, "x", t + 1) * self.x_scale[:, None] + self.x_center[:, None] for t in range(self.horizon)],
-            "u": [self.block(self.last_w, "u", t) * self.u_scale[:, None] + self.u_center[:, None] for t in range(self.horizon)],
-        }
+        if self.last_w is None:
+            raise ValueError("there is no prediction before the first successful make_step")
+        stages = range(self.horizon)
+        return {"x": [self.physical(self.last_w, "x", t + 1) for t in stages], "u": [self.physical(self.last_w, "u", t) for t in stages]}
 
 
 class ActorController:
@@ -556,28 +565,32 @@ class GreedyController(ActorController):
         return self.plant.U_LOW + np.clip(best.x, 0, 1) * span
 
 
-@cache
 def build_controller(name, args):
-    """One of the compared controllers. Cached, so that a worker process builds it once."""
-    torch.set_num_threads(1)
+    """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc" or "rl_mpc"."""
     plant = envs.load(args.env)
     goal = plant.EVAL_GOAL if args.goal is None else np.atleast_1d(args.goal)
-    mu, Q, V = export(load_critic(args.critic, args.env, args.value))
+    greedy = name == "rl_mpc" and args.horizon == 0
+    mu, Q, V = export(load_critic(critic_path(args), args.env, "min" if greedy else args.value))
     if name == "actor":
         return ActorController(plant, mu, goal)
-    if name == "rl_mpc" and args.horizon == 0:
+    if greedy:
         return GreedyController(plant, mu, Q, goal)
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
-    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
+    squared_error, scenarios = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca)), plant.SCENARIOS["mpc"]
     if name == "rl_mpc":
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * args.sigma**2))])
-        return ScenarioMPC(plant, args.horizon, plant.SCENARIOS["mpc"], stage, ca.Function("terminal", [x, g], [-V(x, g)]),
+        return ScenarioMPC(plant, args.horizon, scenarios, stage, ca.Function("terminal", [x, g], [-V(x, g)]),
                            goal=goal, robust_horizon=args.robust_horizon, actor=mu, compile=args.compile,
                            slack_price=args.slack_weight if args.constraints == "soft" else np.inf)  # fmt: skip
-    stage = ca.Function("stage", [x, g], [squared_error])
-    return ScenarioMPC(plant, plant.BENCHMARK["horizon"], plant.SCENARIOS["mpc"], stage, goal=goal,
-                       robust_horizon=int(name == "robust_mpc"), slack_price=plant.BENCHMARK["slack_price"], relaxed_price=1e3,
-                       change_weight=plant.BENCHMARK["change_weight"], compile=args.compile)  # fmt: skip
+    robust, benchmark = name == "robust_mpc", plant.BENCHMARK
+    price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
+    return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
+                       robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
+                       compile=args.compile)  # fmt: skip
+
+
+def critic_path(args):
+    return args.critic or Path(__file__).parent / f"experiments/pretrained/{args.env}_robust.pt"
 
 
 # Closed loop
@@ -585,7 +598,7 @@ def build_controller(name, args):
 
 def draws(plant, episodes, seed):
     """Start states (episodes, n_x) uniform in the constraint box and plants (episodes, n_psi) from the evaluation set."""
-    rngs = [np.random.default_rng([seed, i]) for i in range(episodes)]  # episode i does not depend on how many there are
+    rngs = [np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)]  # episode i does not depend on how many there are
     return np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs]), np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
 
 
@@ -617,32 +630,42 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     return x, u, row
 
 
-def run_job(name, args, episode):
-    """One controller on one of the paired draws, in a worker process: name, episode, x, u and the row of results.csv."""
-    controller = build_controller(name, args)
-    starts, psi = draws(controller.plant, episode + 1, args.seed)
-    x, u, row = run_episode(controller, controller.plant, starts[episode], psi[episode], controller.goal, args.steps)
-    head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0), "critic": args.critic.name,
-            "goal": " ".join(f"{g:g}" for g in controller.goal), "episode": episode, "seed": args.seed,
-            "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
-    return name, episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}
+@cache
+def worker_controller(name, args):
+    """A controller built once in each worker process; a run resets it before every episode."""
+    torch.set_num_threads(1)
+    return build_controller(name, args)
 
 
 def prepare(name, args):
-    """Have a controller compiled before the workers need it."""
-    build_controller(name, args)
+    """Have a controller's problem compiled before the workers need it."""
+    worker_controller(name, args)
+
+
+def run_job(name, args, episode):
+    """One controller on one of the paired draws, in a worker process: name, episode, x, u and the row of results.csv."""
+    controller, critic = worker_controller(name, args), critic_path(args)
+    starts, psi = draws(controller.plant, episode + 1, args.seed)
+    x, u, row = run_episode(controller, controller.plant, starts[episode], psi[episode], controller.goal, args.steps)
+    head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0),
+            "critic": f"{critic.absolute().parent.name}/{critic.name}", "goal": " ".join(f"{g:g}" for g in controller.goal),
+            "episode": episode, "seed": args.seed, "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
+    return name, episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}
 
 
 def compare(args):
     """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
     names, found = dict.fromkeys(args.controllers), {}
-    with ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:  # torch does not survive a fork
+    pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"))  # torch does not survive a fork
+    try:
         list(pool.map(prepare, names, [args] * len(names)))
         slow_first = sorted(names, key=("robust_mpc", "nominal_mpc", "rl_mpc", "actor").index)
         futures = [pool.submit(run_job, name, args, i) for name in slow_first for i in range(args.episodes)]
         for future in tqdm(as_completed(futures), total=len(futures), unit="episode", disable=None):
             name, episode, *result = future.result()
             found[name, episode] = result
+    finally:
+        pool.shutdown(cancel_futures=True)
     rows = [found[name, i][2] for name in names for i in range(args.episodes)]
     paths = {name: [np.stack([found[name, i][k] for i in range(args.episodes)]) for k in range(2)] for name in names}
     return rows, paths
@@ -684,26 +707,20 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    n_x, n_u = len(plant.X_LOW), len(plant.U_LOW)
-    columns = 3 if n_x + n_u > 4 else 2
-    fig, axes = plt.subplots(-(-(n_x + n_u) // columns), columns, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
-    hours = np.arange(args.steps + 1) * plant.DT
-    names = {row["controller"]: label(row) for row in rows}
-    order = [*[("x", i) for i in range(n_x)], *[("u", i) for i in range(n_u)]]
-    for ax, (kind, i) in zip(axes.T.ravel() if columns == 2 else axes.ravel(), order):
+    low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
+    titles = [f"{n} [{u}]" for n, u in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
+    fig, axes = plt.subplots(-(-len(low) // 3), 3, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
+    hours, names = np.arange(args.steps + 1) * plant.DT, {row["controller"]: label(row) for row in rows}
+    for i, (ax, title) in enumerate(zip(axes.ravel(), titles)):
         for name, (x, u) in paths.items():
-            line = dict(color=COLOURS[name], ls=STYLES[name], lw=1.8, label=names[name])
-            if kind == "x":
-                ax.plot(hours, x[episode, :, i], **line)
-            else:
-                ax.step(hours[:-1], u[episode, :, i], where="post", **line)
-        low, high = (plant.X_LOW, plant.X_HIGH) if kind == "x" else (plant.U_LOW, plant.U_HIGH)
+            values = np.hstack([x[episode], np.vstack([u[episode], u[episode][-1:]])])[:, i]
+            style = "default" if i < len(plant.X_LOW) else "steps-post"
+            ax.plot(hours, values, color=COLOURS[name], ls=STYLES[name], lw=1.8, drawstyle=style, label=names[name])
         for bound in (low[i], high[i]):
             ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
-        if kind == "x" and i in plant.GOAL_INDEX:
+        if i in plant.GOAL_INDEX:
             ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
-        symbols, units = (plant.STATE_NAMES, plant.STATE_UNITS) if kind == "x" else (plant.ACTION_NAMES, plant.ACTION_UNITS)
-        ax.set_title(f"{symbols[i]} [{units[i]}]", fontsize=10)
+        ax.set_title(title, fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
     handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
@@ -724,15 +741,11 @@ def check(args):
         plant = envs.load(args.env)
     except ValueError as error:
         fail(error)
-    for name, least in dict(horizon=0, robust_horizon=0, episodes=1, steps=1, jobs=1, seed=0).items():
-        if getattr(args, name) < least:
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be at least {least}")
-    for name in ("sigma", "slack_weight"):
-        if not (np.isfinite(getattr(args, name)) and getattr(args, name) > 0):
-            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must be positive and finite")
-    for name in args.controllers:
-        if name not in LABELS:
-            fail(f"--controllers has {name!r}; choose from {', '.join(LABELS)}")
+    ranges = {"horizon": (0, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "jobs": (1, 1024),
+              "seed": (0, 10**9), "sigma": (1e-6, 1e6), "slack_weight": (1e-6, 1e6)}  # fmt: skip
+    for name, (least, most) in ranges.items():
+        if not least <= getattr(args, name) <= most:  # catches nan too
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{least:g}, {most:g}]")
     if not args.controllers:
         fail(f"--controllers is empty; choose from {', '.join(LABELS)}")
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
@@ -745,7 +758,7 @@ def check(args):
     if ((goal < low) | (goal > high)).any():
         print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)
     try:
-        critic = load_critic(args.critic, args.env, args.value)
+        critic = load_critic(critic_path(args), args.env, args.value)
     except ValueError as error:
         fail(f"--critic {error}")
     return plant, goal, critic
@@ -763,7 +776,7 @@ def main(args):
         difference = check_export(critic, export(critic)[2], plant)
     except RuntimeError as error:
         fail(error)
-    print(f"{args.critic.name}: the CasADi export equals torch to {difference:.0e}")
+    print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}")
     tick = time.perf_counter()
     rows, paths = compare(args)
     with open(out / "results.csv", "w", newline="") as file:

@@ -7,7 +7,9 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     X_LOW, X_HIGH                                 constraint box, also the box of initial states, (n_x,)
     OBS_LOW, OBS_HIGH                             wider box that every reachable state stays in, (n_x,)
     U_LOW, U_HIGH                                 actuator limits, (n_u,)
-    PSI_NAMES, PSI_NOMINAL, SCENARIOS, EVAL_PSI   uncertain parameters: nominal value, named scenario sets, held-out evaluation set
+    PSI_NAMES, PSI_NOMINAL, EVAL_PSI              uncertain parameters, their nominal value, the plants of the evaluation
+    SCENARIOS                                     sets to draw psi from: "nominal", "mpc" (its first is nominal), "robust" (training)
+    BENCHMARK                                     horizon and prices of the MPC that rl_mpc_deploy.py compares with
     GOAL_INDEX                                    which states the goal is about, so `x[..., GOAL_INDEX]` is the achieved goal
     TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE
     ERROR_SCALE                                   size of a large goal error, (n_goal,): normalises the networks' input

@@ -7,6 +7,7 @@ Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc
 """
 
 import csv
+import hashlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +29,9 @@ VARIANTS = {  # label: settings of rl_mpc_deploy.py
     "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
     "RL (actor alone)": dict(controllers=("actor",)),
     "RL+MPC, N = 5": dict(controllers=("rl_mpc",)),
-    "RL+MPC, N = 5, slack weight 3": dict(controllers=("rl_mpc",), slack_weight=3.0),
     "RL, constraint-aware": dict(controllers=("actor",), critic=PRETRAINED / "cstr_constrained.pt"),
     "RL+MPC, N = 5, constraint-aware": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_constrained.pt"),
+    "RL+MPC, N = 5, slack weight 3": dict(controllers=("rl_mpc",), slack_weight=3.0),
 }
 
 
@@ -70,8 +71,9 @@ def collect(args):
     rows = []
     for variant, settings in VARIANTS.items():
         settings = deploy.Args(horizon=5, episodes=episodes, steps=steps, seed=args.seed, jobs=args.jobs, **settings)
-        name = variant.replace(" ", "").replace(",", "_").replace("=", "")
-        path = args.runs / f"{name}_{args.seed}_{episodes}x{steps}.csv"
+        inputs = [Path(deploy.__file__), Path(deploy.__file__).parent / "envs/cstr.py", deploy.critic_path(settings)]
+        version = hashlib.sha256(repr(settings).encode() + b"".join(p.read_bytes() for p in inputs)).hexdigest()[:12]
+        path = args.runs / f"{version}.csv"  # another script, plant, critic or setting is another file
         if not path.exists():
             print(variant)
             write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)

@@ -49,13 +49,24 @@ def main(args):
         table.parent.mkdir(parents=True, exist_ok=True)
         with open(table, "w", newline="") as file:
             writer = csv.writer(file)
-            writer.writerow(["controller", "horizon", "step", *names])
+            writer.writerow(["controller", "horizon", "goal", "alpha", "beta", "step", *names])
             for name in CONTROLLERS:
                 controller = deploy.build_controller(name, settings)
                 x, u, row = deploy.run_episode(controller, plant, X0, np.array([args.alpha, args.beta]), controller.goal, settings.steps)
                 print(name, {key: round(float(value), 2) for key, value in row.items()})
                 for t in range(settings.steps + 1):  # the last action is held for the last row
-                    writer.writerow([name, getattr(controller, "horizon", 0), t, *x[t], *u[min(t, settings.steps - 1)]])
+                    writer.writerow(
+                        [
+                            name,
+                            getattr(controller, "horizon", 0),
+                            args.goal,
+                            args.alpha,
+                            args.beta,
+                            t,
+                            *x[t],
+                            *u[min(t, settings.steps - 1)],
+                        ]
+                    )
     with open(table, newline="") as file:
         rows = list(csv.DictReader(file))
     paths = {}
@@ -63,8 +74,7 @@ def main(args):
         values = np.array([[float(row[column]) for column in names] for row in rows if row["controller"] == name])
         paths[name] = values[None, :, :4], values[None, :-1, 4:]
     (args.out / "figures").mkdir(exist_ok=True)
-    settings = deploy.Args(goal=args.goal, steps=len(values) - 1)
-    deploy.figure(plant, settings, rows, paths, [args.goal], args.out / "figures/cstr_profile.png")
+    deploy.figure(plant, deploy.Args(steps=len(values) - 1), rows, paths, [float(rows[0]["goal"])], args.out / "figures/cstr_profile.png")
 
 
 if __name__ == "__main__":
