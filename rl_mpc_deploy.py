@@ -262,7 +262,7 @@ def compiled_solver(nlp, options):
                 os.replace(built, library)
         return {name: ca.nlpsol(name, "ipopt", str(library), options(name)) for name in ("cold", "warm")}
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        print(f"notice: running interpreted, three to six times slower ({error})", file=sys.stderr)
+        print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
         return None
 
 
