@@ -1,9 +1,12 @@
-"""Figure `cstr_rlmpc`: actor, nominal MPC, robust MPC and RL+MPC on paired draws of start state and plant.
+"""Figure `cstr_rlmpc`: actor, nominal MPC, robust MPC and RL+MPC on paired draws of start state and plant; and which learned value
+serves RL+MPC best.
 
-    python experiments/cstr_deploy.py --jobs 2     # 50 draws, half an hour; continues, variant by variant, where it stopped
-    python experiments/cstr_deploy.py --plot-only  # redraw from the committed CSV
+    python experiments/cstr_deploy.py --jobs 2      # 50 draws, half an hour; continues, variant by variant, where it stopped
+    python experiments/cstr_deploy.py --study value --episodes 24
+    python experiments/cstr_deploy.py --plot-only   # redraw from the committed CSV
 
-Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png.
+Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png; the second
+study writes cstr_value.csv and cstr_value.png.
 """
 
 import csv
@@ -11,6 +14,7 @@ import hashlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -24,19 +28,29 @@ sys.path.insert(0, str(HERE.parent))
 import rl_mpc_deploy as deploy
 
 PRETRAINED = HERE / "pretrained"
-VARIANTS = {  # label: settings of rl_mpc_deploy.py
-    "nominal MPC, N = 20": dict(controllers=("nominal_mpc",)),
-    "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
-    "RL (actor alone)": dict(controllers=("actor",)),
-    "RL+MPC, N = 5": dict(controllers=("rl_mpc",)),
-    "RL, constraint-aware": dict(controllers=("actor",), critic=PRETRAINED / "cstr_constrained.pt"),
-    "RL+MPC, N = 5, constraint-aware": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_constrained.pt"),
-    "RL+MPC, N = 5, slack weight 3": dict(controllers=("rl_mpc",), slack_weight=3.0),
+STUDIES = {  # name: {label: settings of rl_mpc_deploy.py}
+    "deploy": {
+        "nominal MPC, N = 20": dict(controllers=("nominal_mpc",)),
+        "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
+        "RL (actor alone)": dict(controllers=("actor",)),
+        "RL+MPC, N = 5": dict(controllers=("rl_mpc",)),
+        "RL, constraint-aware": dict(controllers=("actor",), critic=PRETRAINED / "cstr_constrained.pt"),
+        "RL+MPC, N = 5, constraint-aware": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_constrained.pt"),
+        "RL+MPC, N = 5, slack weight 3": dict(controllers=("rl_mpc",), slack_weight=3.0),
+    },
+    "value": {
+        "first critic": dict(controllers=("rl_mpc",)),
+        "minimum of both critics": dict(controllers=("rl_mpc",), value="min"),
+        "mean of both critics": dict(controllers=("rl_mpc",), value="mean"),
+        "no entropy in the target": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_no_entropy.pt"),
+    },
 }
 
 
 @dataclass
 class Args:
+    study: Literal["deploy", "value"] = "deploy"
+    """deploy: the controllers against each other; value: RL+MPC with each way to read a value out of a checkpoint"""
     episodes: int = 50
     """paired draws"""
     seed: int = 0
@@ -69,7 +83,7 @@ def write(rows, path):
 def collect(args):
     episodes, steps = (2, 10) if args.quick else (args.episodes, 100)
     rows = []
-    for variant, settings in VARIANTS.items():
+    for variant, settings in STUDIES[args.study].items():
         settings = deploy.Args(horizon=5, episodes=episodes, steps=steps, seed=args.seed, jobs=args.jobs, **settings)
         inputs = [Path(deploy.__file__), Path(deploy.__file__).parent / "envs/cstr.py", deploy.critic_path(settings)]
         version = hashlib.sha256(repr(settings).encode() + b"".join(p.read_bytes() for p in inputs)).hexdigest()[:12]
@@ -78,18 +92,18 @@ def collect(args):
             print(variant)
             write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)
         rows += read(path)
-    write(rows, args.out / "results/cstr_deploy.csv")
+    write(rows, args.out / f"results/cstr_{args.study}.csv")
 
 
 def plot(args):
-    rows = read(args.out / "results/cstr_deploy.csv")
+    variants, rows = STUDIES[args.study], read(args.out / f"results/cstr_{args.study}.csv")
     columns = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
-    fig, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
+    fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.45 * len(variants)), sharey=True, layout="constrained")
     print(f"{'':33s}{'time near goal':>27s}{'time outside constraints':>39s}{'offset':>9s}{'solve ms':>16s}{'failed':>9s}")
     print(
         f"{'':33s}{'median  5 %-ile    worst':>27s}{'median  5 %-ile    worst     mean':>39s}{'%':>9s}{'median     p95':>16s}{'solves':>9s}"
     )
-    for position, variant in enumerate(VARIANTS):
+    for position, variant in enumerate(variants):
         mine = {key: np.array([row[key] for row in rows if row["variant"] == variant]) for key in rows[0]}
         line = f"{variant:33s}"
         for ax, (key, title) in zip(axes, columns.items()):
@@ -104,11 +118,11 @@ def plot(args):
         times, failed = (mine[key].astype(float) for key in ("solve_ms_median", "solver_failures"))
         print(f"{line[:-3]}{values.mean():9.1f}{np.median(mine['ape_tail'].astype(float)):9.2f}{np.median(times):8.1f}"
               f"{np.quantile(mine['solve_ms_p95'].astype(float), 0.5):8.1f}{failed.sum():9.0f}")  # fmt: skip
-    axes[0].set_yticks(-np.arange(len(VARIANTS)), list(VARIANTS))
+    axes[0].set_yticks(-np.arange(len(variants)), list(variants))
     for ax in axes:
         ax.grid(axis="x", alpha=0.3)
-    fig.suptitle(f"{len(rows) // len(VARIANTS)} paired draws of start state and plant; box 25-75 %, whiskers 5-95 %", fontsize=10)
-    path = args.out / "figures/cstr_deploy.png"
+    fig.suptitle(f"{len(rows) // len(variants)} paired draws of start state and plant; box 25-75 %, whiskers 5-95 %", fontsize=10)
+    path = args.out / f"figures/cstr_{args.study}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(path, dpi=150)
 
