@@ -48,7 +48,6 @@ from tqdm import tqdm
 
 import envs
 
-MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in the prediction; the simulated plant takes 8
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 
@@ -61,7 +60,7 @@ class Args:
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
     critic: Path | None = None
     """a checkpoint.pt of sac_her_branching.py; default: experiments/pretrained/{env}_robust.pt"""
-    goal: float | None = None
+    goal: tuple[float, ...] | None = None
     """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
     episodes: int = 4
     """paired draws of start state and plant parameters"""
@@ -91,22 +90,6 @@ class Args:
 
 
 # Networks, as in sac_her_branching.py: a checkpoint loads into them with strict=True
-
-
-class Scaling:
-    """Affine maps between physical and network units, kept in the checkpoint as plain lists."""
-
-    def __init__(self, **values):
-        for name, value in values.items():
-            setattr(self, name, torch.tensor(value, dtype=torch.long if name == "goal_index" else torch.float64))
-
-    def features(self, x, goal, goal_input):
-        """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_x + n_goal)."""
-        if goal_input == "error":
-            g = (goal - x[:, self.goal_index]) / self.error_scale
-        else:
-            g = (goal - self.goal_center) / self.goal_scale
-        return torch.cat([(x - self.x_center) / self.x_scale, g], dim=-1)
 
 
 class Actor(nn.Module):
@@ -143,19 +126,31 @@ class TwinCritic(nn.Module):
 class Critic:
     """Actor and twin critics of a checkpoint in float64: float32 noise (1e-6 at |V| = 40) is above the solver's tolerance."""
 
-    COMBINE = {"min": lambda q: q.amin(0), "first": lambda q: q[0], "mean": lambda q: q.mean(0)}
-
     def __init__(self, data, value):
-        self.data, self.combine, self.goal_input = data, value, data["goal_input"]
-        self.actor, self.critic = Actor(**data["network"]).double(), TwinCritic(**data["network"]).double()
+        self.network, self.goal_input, self.combine = data["network"], data["goal_input"], value
+        self.actor, self.critic = Actor(**self.network).double(), TwinCritic(**self.network).double()
         self.actor.load_state_dict(data["actor"])
         self.critic.load_state_dict(data["critic"])
-        self.scaling = Scaling(**data["scaling"])
+        # affine maps between physical and network units
+        self.scaling = {k: np.array(v, dtype=int if k.endswith("index") else float) for k, v in data["scaling"].items()}
+
+    def features(self, x, goal, xp):
+        """Network input, components along the first axis, xp torch or casadi: x (n_x, B), goal (n_goal, B) -> (n_in, B)."""
+        concat = torch.cat if xp is torch else lambda parts: ca.vertcat(*parts)
+        s = {k: v.tolist() if v.dtype == int else v if xp is ca else torch.from_numpy(v)[:, None] for k, v in self.scaling.items()}
+        if self.goal_input == "error":
+            goal = goal - x[s["goal_index"], :]
+            g = goal / s["error_scale"]
+        else:
+            g = (goal - s["goal_center"]) / s["goal_scale"]
+        angles = concat([x, goal])[s["angle_index"], :]
+        return concat([concat([(x - s["x_center"]) / s["x_scale"], g])[s["other_index"], :], xp.sin(angles), xp.cos(angles)])
 
     def value(self, x, goal):
         """V(x, g) = Q(x, mu(x, g), g) in torch, (B, n_x) and (B, n_goal) -> (B,)."""
-        z = self.scaling.features(x, goal, self.goal_input)
-        return self.COMBINE[self.combine](self.critic(z, self.actor.act(z)))
+        z = self.features(x.T, goal.T, torch).T
+        q = self.critic(z, self.actor.act(z))
+        return {"min": q.amin(0), "first": q[0], "mean": q.mean(0)}[self.combine]
 
 
 def load_critic(path, env, value="first"):
@@ -184,9 +179,6 @@ def load_critic(path, env, value="first"):
 def export(critic):
     """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64."""
 
-    def array(tensor):
-        return tensor.detach().double().numpy()
-
     def mlp(layers, h):
         for i, (w, b) in enumerate(layers):
             h = w @ h + b
@@ -194,19 +186,14 @@ def export(critic):
                 h = h * (1 + ca.tanh(h / 2)) / 2  # SiLU; exp(-h) would overflow in its derivatives
         return h
 
-    scaling, net = {k: array(v) for k, v in vars(critic.scaling).items()}, critic.data["network"]
-    n_x, n_goal, n_u = len(scaling["x_center"]), len(scaling["goal_center"]), net["n_u"]
-    x, goal, u = ca.MX.sym("x", n_x), ca.MX.sym("goal", n_goal), ca.MX.sym("u", n_u)
-    achieved = x[critic.scaling.goal_index.tolist()]
-    if critic.goal_input == "error":
-        g = (goal - achieved) / scaling["error_scale"]
-    else:
-        g = (goal - scaling["goal_center"]) / scaling["goal_scale"]
-    z = ca.vertcat((x - scaling["x_center"]) / scaling["x_scale"], g)
-    actor_layers = [(array(layer.weight), array(layer.bias)) for layer in [*critic.actor.layers, critic.actor.head]]
-    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor_layers, z)[:n_u]) * scaling["u_scale"] + scaling["u_center"]])
-    za = ca.vertcat(z, (u - scaling["u_center"]) / scaling["u_scale"])
-    q = [mlp([(array(w[j]).T, array(b[j, 0])) for w, b in zip(critic.critic.weight, critic.critic.bias)], za) for j in range(2)]
+    s, n_u = critic.scaling, critic.network["n_u"]
+    x, goal, u = ca.MX.sym("x", len(s["x_center"])), ca.MX.sym("goal", len(s["goal_center"])), ca.MX.sym("u", n_u)
+    z = critic.features(x, goal, ca)
+    actor_layers = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in [*critic.actor.layers, critic.actor.head]]
+    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor_layers, z)[:n_u]) * s["u_scale"] + s["u_center"]])
+    za = ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])
+    critic_layers = [(w.detach().numpy(), b.detach().numpy()) for w, b in zip(critic.critic.weight, critic.critic.bias)]
+    q = [mlp([(w[j].T, b[j, 0]) for w, b in critic_layers], za) for j in range(2)]
     combined = {"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]
     Q = ca.Function("Q", [x, u, goal], [combined])
     V = ca.Function("V", [x, goal], [Q(x, mu(x, goal), goal)], ["x", "goal"], ["V"])
@@ -220,13 +207,13 @@ def check_export(critic, V, plant, points=64, tolerance=1e-8):
     goal = torch.tensor(rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW))))
     value = critic.value(x, goal)
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    gradient = (gradient * critic.scaling.x_scale).detach().numpy()  # per unit of the network's input, as the value is
+    gradient = gradient.numpy() * critic.scaling["x_scale"]  # per unit of the network's input, as the value is
     xs, gs = ca.MX.sym("x", V.size1_in(0)), ca.MX.sym("goal", V.size1_in(1))
     both = ca.Function("both", [xs, gs], [V(xs, gs), ca.gradient(V(xs, gs), xs)]).map(points)
     v, dv = (np.array(a) for a in both(x.detach().numpy().T, goal.numpy().T))
-    dv = dv.T * critic.scaling.x_scale.numpy()
-    scale = 1 + np.abs(value.detach().numpy()).max()
-    worst = max(np.abs(v[0] - value.detach().numpy()).max(), np.abs(dv - gradient).max()) / scale
+    dv = dv.T * critic.scaling["x_scale"]
+    value = value.detach().numpy()
+    worst = max(np.abs(v[0] - value).max(), np.abs(dv - gradient).max()) / (1 + np.abs(value).max())
     if not worst < tolerance:
         raise RuntimeError(f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run")
     return worst
@@ -266,16 +253,6 @@ def compiled_solver(nlp, options):
         return None
 
 
-def checked_state(plant, x0):
-    """The measured state as a float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
-    x0 = np.asarray(x0, dtype=float)
-    if x0.shape != plant.X_LOW.shape:
-        raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
-    if not np.isfinite(x0).all():
-        raise ValueError(f"state is {x0}; every entry must be finite")
-    return x0
-
-
 class ScenarioMPC:
     """eq:QMPC (with a learned value) or eq:multiMPCobj (without), by multiple shooting over a scenario tree.
 
@@ -299,7 +276,8 @@ class ScenarioMPC:
         self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
         self.relaxed_price = relaxed_price
         self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight)
-        self.x_center, self.x_scale = (plant.X_LOW + plant.X_HIGH) / 2, (plant.X_HIGH - plant.X_LOW) / 2
+        self.x_center, self.x_scale = (plant.INIT_LOW + plant.INIT_HIGH) / 2, (plant.INIT_HIGH - plant.INIT_LOW) / 2
+        self.box = (plant.X_LOW - self.x_center) / self.x_scale, (plant.X_HIGH - self.x_center) / self.x_scale
         self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
         self._build_tree()
         self._build_problem()
@@ -314,7 +292,7 @@ class ScenarioMPC:
         self.psi = [None] + [self.scenarios[np.arange(n) % S].T for n in self.nodes[1:]]  # (n_psi, nodes)
 
     def _build_problem(self):
-        """Variables, constraints and objective of eq:QMPC, stage by stage, scaled so that the box becomes [-1, 1]."""
+        """Variables, constraints and objective of eq:QMPC, stage by stage, in units of the box of initial states."""
         n_x, n_u = self.n_x, self.n_u
         x_now, goal, u_before = ca.MX.sym("x_now", n_x), ca.MX.sym("goal", len(self.goal)), ca.MX.sym("u_before", n_u)
         price = ca.MX.sym("price", n_x, 2)  # of slack below and above
@@ -332,8 +310,8 @@ class ScenarioMPC:
         def constrain(name, t, expression, low, high):
             self.layout[name, t] = sum(v.numel() for v in g), *expression.shape
             g.append(expression)
-            lbg.append(np.full(expression.numel(), low))
-            ubg.append(np.full(expression.numel(), high))
+            lbg.append(np.broadcast_to(np.transpose([low]), expression.shape).ravel("F"))
+            ubg.append(np.broadcast_to(np.transpose([high]), expression.shape).ravel("F"))
 
         x, u_parent = x_now, u_before  # physical units, one column per node
         for t in range(self.horizon):
@@ -348,7 +326,7 @@ class ScenarioMPC:
             # X_LOW <= x_{t+1} + below - above <= X_HIGH, slack >= 0; a hard bound is a slack fixed at zero
             below = variable("below", t + 1, n_x, n_next, 0.0, np.inf)
             above = variable("above", t + 1, n_x, n_next, 0.0, np.inf)
-            constrain("box", t + 1, (x_next - self.x_center) / self.x_scale + below - above, -1.0, 1.0)
+            constrain("box", t + 1, (x_next - self.x_center) / self.x_scale + below - above, *self.box)
             slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
             J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost)
             change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
@@ -358,7 +336,7 @@ class ScenarioMPC:
         self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
         self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
-        self.step_nodes = {n: step.map(n) for n in set(self.nodes)}
+        self.step = step
 
     def node_cost(self, t, x, goal, slack_cost):
         """Cost of stage t, averaged over its nodes: x (n_x, nodes), goal (n_goal, nodes), slack_cost (1, nodes)."""
@@ -370,12 +348,12 @@ class ScenarioMPC:
     def _model_step(self):
         """Prediction model (x, u, psi) -> x one sampling time later."""
         x, u, psi = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u), ca.SX.sym("psi", self.scenarios.shape[1])
-        dt, plant = self.plant.DT / MODEL_SUBSTEPS, self.plant
+        dt, plant = self.plant.DT / self.plant.MODEL_SUBSTEPS, self.plant
         # one substep is the unit that is differentiated and compiled: unrolled, the four take three times as long to compile
         substep = ca.Function("substep", [x, u, psi], [envs.rk4(plant.ode, x, u, psi, dt, 1, ca)], {"never_inline": True})
         x, u, psi = ca.MX.sym("x", self.n_x), ca.MX.sym("u", self.n_u), ca.MX.sym("psi", self.scenarios.shape[1])
         x_next = x
-        for _ in range(MODEL_SUBSTEPS):
+        for _ in range(plant.MODEL_SUBSTEPS):
             x_next = substep(x_next, u, psi)
         return ca.Function("step", [x, u, psi], [x_next], {"never_inline": True})
 
@@ -424,12 +402,12 @@ class ScenarioMPC:
         for t in range(self.horizon):
             u = np.clip(action(t, x), self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None])
             parent = self.parent[t + 1]
-            x = np.array(self.step_nodes[self.nodes[t + 1]](x[:, parent], u[:, parent], self.psi[t + 1]))
+            x = np.array(self.step(x[:, parent], u[:, parent], self.psi[t + 1]))
             scaled = (x - self.x_center[:, None]) / self.x_scale[:, None]
             self.block(w, "u", t)[:] = (u - self.u_center[:, None]) / self.u_scale[:, None]
             self.block(w, "x", t + 1)[:] = scaled
-            self.block(w, "below", t + 1)[:] = np.maximum(-1 - scaled, 0)
-            self.block(w, "above", t + 1)[:] = np.maximum(scaled - 1, 0)
+            self.block(w, "below", t + 1)[:] = np.maximum(self.box[0][:, None] - scaled, 0)
+            self.block(w, "above", t + 1)[:] = np.maximum(scaled - self.box[1][:, None], 0)
         return w
 
     def hold_guess(self, x0):
@@ -445,7 +423,7 @@ class ScenarioMPC:
 
     def set_initial_guess(self, x0):
         """Forget the previous plan: the next solve starts from `cold_guess`."""
-        checked_state(self.plant, x0)
+        envs.checked_state(self.plant, x0)
         self.plan, self.plan_left = None, 0
 
     def _parameters(self, x0, price):
@@ -454,6 +432,7 @@ class ScenarioMPC:
     def _bounds(self, price):
         """Bounds of the problem under a slack price: slack is fixed at zero where a bound is hard (inf) or ignored (0)."""
         bounds = {key: value.copy() for key, value in self.bounds.items()}
+        price = np.where(np.isinf(self.box), 0.0, price)
         for t in range(1, self.horizon + 1):
             for name, bound, no_bound, p in (("below", "lbg", -np.inf, price[0]), ("above", "ubg", np.inf, price[1])):
                 self.block(bounds["ubx"], name, t)[(p == 0) | np.isinf(p)] = 0.0
@@ -479,7 +458,7 @@ class ScenarioMPC:
         one more from a cold guess that was not tried yet (with relaxed bounds, if relaxed_price is given); then the next action
         of the last successful plan, while it lasts; then the actor, or without one the last action. `stats` says which.
         """
-        x0, tick = checked_state(self.plant, x0), time.perf_counter()
+        x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
         cold, start, multipliers = self.cold_guess(x0), "cold", ()
         if self.plan is not None:
@@ -532,7 +511,7 @@ class ActorController:
         """Nothing to guess."""
 
     def make_step(self, x0):
-        x0, tick = checked_state(self.plant, x0), time.perf_counter()
+        x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         u = np.array(self.actor(x0, self.goal)).ravel()
         self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
         return np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
@@ -550,7 +529,7 @@ class GreedyController(ActorController):
         self.grid = np.stack([a.ravel() for a in axes])  # (n_u, points^n_u)
 
     def make_step(self, x0):
-        x0, tick = checked_state(self.plant, x0), time.perf_counter()
+        x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         span = self.plant.U_HIGH - self.plant.U_LOW
         on_grid = np.array(self.negative_q(self.grid, x0)[0]).ravel()
         starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.grid[:, on_grid.argmin()]]
@@ -568,7 +547,7 @@ class GreedyController(ActorController):
 def build_controller(name, args):
     """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc" or "rl_mpc"."""
     plant = envs.load(args.env)
-    goal = plant.EVAL_GOAL if args.goal is None else np.atleast_1d(args.goal)
+    goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal)
     greedy = name == "rl_mpc" and args.horizon == 0
     mu, Q, V = export(load_critic(critic_path(args), args.env, "min" if greedy else args.value))
     if name == "actor":
@@ -615,10 +594,9 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     rungs = [s["rung"] for s in log]
     milliseconds = [s["wall_ms"] for s in log]
     achieved = x[1:, plant.GOAL_INDEX]
-    outside = np.sum((x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)) ** 2, axis=-1)
     row = {
-        "time_near_goal": np.exp(-np.sum(plant.goal_error(achieved, goal) ** 2, axis=-1) / (2 * METRIC_SIGMA2)).sum(),
-        "time_outside_constraints": np.sum(np.exp(-outside / (2 * METRIC_SIGMA2)) - 1),
+        "time_near_goal": envs.goal_reward(plant, achieved, goal, sigma2=METRIC_SIGMA2).sum(),
+        "time_outside_constraints": envs.outside_constraints(plant, x[1:], METRIC_SIGMA2).sum(),
         "ape_tail": plant.percentage_error(achieved, np.asarray(goal))[-25:].mean(),
         "solve_ms_median": np.median(milliseconds),
         "solve_ms_p95": np.quantile(milliseconds, 0.95),
@@ -675,8 +653,7 @@ def compare(args):
 
 
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC", "rl_mpc": "RL+MPC"}
-COLOURS = {"actor": "#D55E00", "nominal_mpc": "#999999", "robust_mpc": "#0072B2", "rl_mpc": "#009E73"}  # Okabe and Ito
-STYLES = {"actor": "--", "nominal_mpc": ":", "robust_mpc": "-.", "rl_mpc": "-"}
+STYLES = {"actor": ("#D55E00", "--"), "nominal_mpc": ("#999999", ":"), "robust_mpc": ("#0072B2", "-."), "rl_mpc": ("#009E73", "-")}
 
 
 def label(row):
@@ -690,13 +667,13 @@ def table(rows):
         "controller              median [worst]  median [worst]       %  median      p95   solves  retry   plan   actor",
     ]
     for name in dict.fromkeys(row["controller"] for row in rows):
-        mine = {key: np.array([row[key] for row in rows if row["controller"] == name]) for key in rows[0]}
-        title = label({key: column[0] for key, column in mine.items()})
-        median = {key: np.median(column) for key, column in mine.items() if column.dtype.kind == "f"}
-        near, outside = (f"{median[key]:6.1f} [{mine[key].min():5.1f}]" for key in ("time_near_goal", "time_outside_constraints"))
-        failed, *rungs = (mine[key].sum() for key in ("solver_failures", "retries", "fallback_plan", "fallback_actor"))
-        times = f"{median['solve_ms_median']:6.1f}  {median['solve_ms_p95']:7.1f}"
-        lines.append(f"{title:22s}  {near}  {outside}  {median['ape_tail']:6.2f}  {times}  {failed:7d}" + "".join(f"{n:7d}" for n in rungs))
+        mine = [row for row in rows if row["controller"] == name]
+        near, outside, offset, median, p95 = (np.array([row[key] for row in mine]) for key in list(mine[0])[8:13])
+        failed, *rungs = (sum(row[key] for row in mine) for key in list(mine[0])[13:])
+        lines.append(
+            f"{label(mine[0]):22s}  {np.median(near):6.1f} [{near.min():5.1f}]  {np.median(outside):6.1f} [{outside.min():5.1f}]  "
+            f"{np.median(offset):6.2f}  {np.median(median):6.1f}  {np.median(p95):7.1f}  {failed:7d}" + "".join(f"{n:7d}" for n in rungs)
+        )
     return "\n".join(lines)
 
 
@@ -714,10 +691,11 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
     for i, (ax, title) in enumerate(zip(axes.ravel(), titles)):
         for name, (x, u) in paths.items():
             values = np.hstack([x[episode], np.vstack([u[episode], u[episode][-1:]])])[:, i]
-            style = "default" if i < len(plant.X_LOW) else "steps-post"
-            ax.plot(hours, values, color=COLOURS[name], ls=STYLES[name], lw=1.8, drawstyle=style, label=names[name])
+            (colour, dashes), style = STYLES[name], "default" if i < len(plant.X_LOW) else "steps-post"
+            ax.plot(hours, values, color=colour, ls=dashes, lw=1.8, drawstyle=style, label=names[name])
         for bound in (low[i], high[i]):
-            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
+            if np.isfinite(bound):
+                ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
         if i in plant.GOAL_INDEX:
             ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
         ax.set_title(title, fontsize=10)
@@ -751,9 +729,9 @@ def check(args):
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
     if leaves > 1000:
         fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
-    goal = plant.EVAL_GOAL if args.goal is None else np.atleast_1d(args.goal)
-    if goal.shape != plant.EVAL_GOAL.shape or not (np.isfinite(goal) & (plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
-        fail(f"--goal is {args.goal}; it must lie in [{plant.GOAL_LOW[0]:g}, {plant.GOAL_HIGH[0]:g}]")
+    goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal)
+    if goal.shape != plant.EVAL_GOAL.shape or not ((plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
+        fail(f"--goal is {args.goal}; it needs {len(plant.GOAL_LOW)} number(s) in {plant.GOAL_LOW} to {plant.GOAL_HIGH}")
     low, high = plant.GOAL_REACHABLE
     if ((goal < low) | (goal > high)).any():
         print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)

@@ -40,8 +40,6 @@ from tqdm import tqdm
 
 import envs
 
-CONSTRAINT_SIGMA2 = 0.01  # physical units squared, of the paper's time outside constraints
-
 
 @dataclass
 class Args:
@@ -121,24 +119,33 @@ class Scaling:
     def __init__(self, device="cpu", **values):
         self.values = values
         for name, value in values.items():
-            setattr(self, name, torch.tensor(value, device=device, dtype=torch.long if name == "goal_index" else torch.float32))
+            setattr(self, name, torch.tensor(value, device=device, dtype=torch.long if name.endswith("index") else torch.float32))
 
     @classmethod
     def of(cls, plant, device="cpu"):
         def affine(name, low, high):
             return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": ((high - low) / 2).tolist()}
 
-        i, goals = plant.GOAL_INDEX, affine("goal", plant.X_LOW[plant.GOAL_INDEX], plant.X_HIGH[plant.GOAL_INDEX])
-        return cls(device, **affine("x", plant.X_LOW, plant.X_HIGH), **affine("u", plant.U_LOW, plant.U_HIGH), **goals,
-                   error_scale=plant.ERROR_SCALE.tolist(), goal_index=i)  # fmt: skip
+        i, n_x = plant.GOAL_INDEX, len(plant.INIT_LOW)
+        goals = affine("goal", plant.INIT_LOW[i], plant.INIT_HIGH[i])
+        columns = list(range(n_x)) + i  # of [x, goal]: the state that each is about
+        angles = [j for j, state in enumerate(columns) if state in plant.ANGLES]
+        others = [j for j in range(len(columns)) if j not in angles]
+        return cls(device, **affine("x", plant.INIT_LOW, plant.INIT_HIGH), **affine("u", plant.U_LOW, plant.U_HIGH), **goals,
+                   error_scale=plant.ERROR_SCALE.tolist(), goal_index=i, angle_index=angles, other_index=others)  # fmt: skip
 
     def features(self, x, goal, goal_input):
-        """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_x + n_goal)."""
+        """Physical state (B, n_x) and goal (B, n_goal) -> network input (B, n_in), angles as sine and cosine."""
         if goal_input == "error":
-            g = (goal - x[:, self.goal_index]) / self.error_scale
+            g = goal = goal - x[:, self.goal_index]
+            g = g / self.error_scale
         else:
             g = (goal - self.goal_center) / self.goal_scale
-        return torch.cat([(x - self.x_center) / self.x_scale, g], dim=-1)
+        z = torch.cat([(x - self.x_center) / self.x_scale, g], dim=-1)
+        if not len(self.angle_index):
+            return z
+        angles = torch.cat([x, goal], dim=-1)[:, self.angle_index]
+        return torch.cat([z[:, self.other_index], torch.sin(angles), torch.cos(angles)], dim=-1)
 
 
 class Actor(nn.Module):
@@ -239,16 +246,11 @@ class HERBuffer:
 
     def __init__(self, capacity, num_envs, n_x, n_u, n_goal, goal_index, branches, strategy, ratio, device="cpu"):
         self.rows, self.num_envs, self.branches, self.strategy, self.ratio = capacity // num_envs, num_envs, branches, strategy, ratio
-        self.goal_index = torch.tensor(goal_index, device=device)
-        self.now = 0  # time steps written so far
-        shape = (self.rows, num_envs)
-        self.x = torch.zeros(*shape, n_x, device=device)
-        self.u = torch.zeros(*shape, n_u, device=device)
-        self.goal = torch.zeros(*shape, n_goal, device=device)
-        self.x_next = torch.zeros(*shape, n_x, device=device)
-        self.branch_next = torch.zeros(*shape, branches if branches > 1 else 0, n_x, device=device)
-        self.start = torch.zeros(shape, dtype=torch.long, device=device)  # time at which the transition's episode began
-        self.end = torch.zeros(shape, dtype=torch.long, device=device)  # its last time
+        self.goal_index, self.now = torch.tensor(goal_index, device=device), 0  # now: time steps written so far
+        self.x, self.u, self.goal, self.x_next = (torch.zeros(self.rows, num_envs, n, device=device) for n in (n_x, n_u, n_goal, n_x))
+        self.branch_next = torch.zeros(self.rows, num_envs, branches if branches > 1 else 0, n_x, device=device)
+        # times at which the transition's episode began and ends
+        self.start, self.end = torch.zeros(2, self.rows, num_envs, dtype=torch.long, device=device)
         self.episode_start = torch.zeros(num_envs, dtype=torch.long, device=device)
 
     def add(self, x, u, goal, x_next, branch_next, done):
@@ -295,9 +297,9 @@ class SAC:
 
     def __init__(self, args, plant, device):
         self.args, self.plant, self.device = args, plant, device
-        n_x, n_goal, n_u = len(plant.X_LOW), len(plant.GOAL_INDEX), len(plant.U_LOW)
-        self.network = dict(n_in=n_x + n_goal, n_u=n_u, hidden=list(args.hidden))
         self.scaling = Scaling.of(plant, device)
+        n_u, n_in = len(plant.U_LOW), len(plant.INIT_LOW) + len(plant.GOAL_INDEX) + len(self.scaling.angle_index)
+        self.network = dict(n_in=n_in, n_u=n_u, hidden=list(args.hidden))
         with torch.random.fork_rng(devices=[]):  # torch.nn initialises from the global generator; leave it as it was
             torch.manual_seed(args.seed)
             self.actor = Actor(**self.network).to(device)
@@ -332,8 +334,7 @@ class SAC:
         achieved = x[:, self.scaling.goal_index]
         reward = envs.goal_reward(self.plant, achieved, g, a.smooth_reward, a.reward_sigma2, a.reward_tolerance, xp=torch)
         if a.constraint_weight:  # so that a planner cannot put a violation off to after its horizon, where it would be free
-            outside = F.relu(z[:, : x.shape[1]].abs() - 1) * self.scaling.x_scale  # distance to the box, which is [-1, 1] in z
-            reward = reward + a.constraint_weight * (torch.exp(-(outside**2).sum(-1) / (2 * CONSTRAINT_SIGMA2)) - 1)
+            reward = reward + a.constraint_weight * envs.outside_constraints(self.plant, x, xp=torch)
         # the plants do not terminate, and the time limit is bootstrapped through
         value = self.target(z, action).amin(0)
         if a.entropy_in_target:
@@ -385,13 +386,14 @@ class SAC:
 # Evaluation and files
 
 
-def evaluate(policy, goal, episodes, seed, robust, steps=50, tail=25):
-    """The paper's protocol: start states uniform in the constraint box, 50 steps, error over the last 25.
+def evaluate(policy, goal, episodes, seed, robust):
+    """The paper's protocol: start states uniform in the plant's box, one episode (cstr: 50 steps), error over its second half.
 
     Robust: psi drawn per episode from the plant's evaluation set and held; otherwise the nominal plant. Returns the mean
     absolute percentage error of each episode (episodes,) and whether its plant is held out from the training grid (episodes,).
     """
     plant, rng = policy.plant, np.random.default_rng([seed, 1])  # a stream of its own: training starts come from [seed]
+    steps = plant.EPISODE_STEPS
     x = envs.sample_states(plant, rng, episodes)
     psi = rng.choice(plant.EVAL_PSI, size=episodes)
     if not robust:
@@ -399,7 +401,7 @@ def evaluate(policy, goal, episodes, seed, robust, steps=50, tail=25):
     errors = []
     for t in range(steps):
         x = plant.step(x, policy.act(x, goal), psi)
-        if t >= steps - tail:
+        if t >= steps - steps // 2:
             errors.append(plant.percentage_error(x[:, plant.GOAL_INDEX], np.asarray(goal)))
     held_out = ~np.isclose(psi[:, None], plant.SCENARIOS["robust"]).all(-1).any(-1)
     return np.mean(errors, axis=0), held_out

@@ -4,8 +4,11 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
 
     ENV_ID, EPISODE_STEPS, DT, TIME_UNIT          gymnasium id, steps before truncation, sampling time
     STATE_NAMES, STATE_UNITS, ACTION_NAMES, ...   for tables and figures
-    X_LOW, X_HIGH                                 constraint box, also the box of initial states, (n_x,)
+    X_LOW, X_HIGH                                 constraint box, (n_x,), infinite where there is no constraint
+    INIT_LOW, INIT_HIGH                           box of initial states, finite: it also scales states for networks and solvers
     OBS_LOW, OBS_HIGH                             wider box that every reachable state stays in, (n_x,)
+    ANGLES                                        indices of states that are angles (networks see their sine and cosine)
+    START, START_NOISE                            one start state, and how far a seed moves it (goal_mpc.py)
     U_LOW, U_HIGH                                 actuator limits, (n_u,)
     PSI_NAMES, PSI_NOMINAL, EVAL_PSI              uncertain parameters, their nominal value, the plants of the evaluation
     SCENARIOS                                     sets to draw psi from: "nominal", "mpc" (its first is nominal), "robust" (training)
@@ -13,8 +16,10 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     GOAL_INDEX                                    which states the goal is about, so `x[..., GOAL_INDEX]` is the achieved goal
     TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE
     ERROR_SCALE                                   size of a large goal error, (n_goal,): normalises the networks' input
-    REWARD_SIGMA2, REWARD_TOLERANCE               width of the Gaussian reward, half-width of the sparse one
+    REWARD_SIGMA2, REWARD_TOLERANCE, MPC_SIGMA2   width of the Gaussian reward, half-width of the sparse one, width in goal_mpc.py
     ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
+    MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
+optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), skeleton(x) (points to draw)
 
 `GoalEnv` and `VectorGoalEnv` below turn such a module into environments; importing `envs` registers one id per module.
 """
@@ -65,8 +70,8 @@ def load(name):
 
 
 def sample_states(plant, rng, n):
-    """Initial states uniform in the constraint box, (n, n_x)."""
-    return rng.uniform(plant.X_LOW, plant.X_HIGH, size=(n, len(plant.X_LOW)))
+    """Initial states uniform in their box, (n, n_x)."""
+    return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH, size=(n, len(plant.INIT_LOW)))
 
 
 def goal_reward(plant, achieved, goal, smooth=True, sigma2=None, tolerance=None, xp=np):
@@ -75,6 +80,22 @@ def goal_reward(plant, achieved, goal, smooth=True, sigma2=None, tolerance=None,
     if smooth:
         return xp.exp(-(error**2).sum(-1) / (2 * (plant.REWARD_SIGMA2 if sigma2 is None else sigma2)))
     return 1.0 * (abs(error) <= (plant.REWARD_TOLERANCE if tolerance is None else tolerance)).all(-1)
+
+
+def outside_constraints(plant, x, sigma2=0.01, xp=np):
+    """The paper's measure of constraint violation, exp(-|x - clip(x)|^2 / (2 sigma2)) - 1, x (..., n_x) -> (...): 0 inside the box."""
+    low, high = (xp.asarray(bound, dtype=x.dtype, device=x.device) for bound in (plant.X_LOW, plant.X_HIGH))
+    return xp.exp(-((x - xp.clip(x, low, high)) ** 2).sum(-1) / (2 * sigma2)) - 1
+
+
+def checked_state(plant, x0):
+    """The measured state as a float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
+    x0 = np.asarray(x0, dtype=float)
+    if x0.shape != plant.X_LOW.shape:
+        raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"state is {x0}; every entry must be finite")
+    return x0
 
 
 class _PlantSpaces:

@@ -16,10 +16,14 @@ TIME_UNIT = "h"
 
 STATE_NAMES = ("c_A", "c_B", "T_R", "T_K")
 STATE_UNITS = ("mol/l", "mol/l", "°C", "°C")
-X_LOW = np.array([0.1, 0.1, 50.0, 50.0])  # constraint box, and box of initial states
+X_LOW = np.array([0.1, 0.1, 50.0, 50.0])
 X_HIGH = np.array([2.0, 2.0, 140.0, 140.0])
+INIT_LOW, INIT_HIGH = X_LOW, X_HIGH
 OBS_LOW = np.array([0.0, 0.0, -50.0, -50.0])  # never left: the feed holds 5.1 mol/l of A
 OBS_HIGH = np.array([6.0, 6.0, 400.0, 400.0])
+ANGLES = []
+START = np.array([0.8, 0.3, 100.14, 100.0])  # of the paper's trajectories
+START_NOISE = np.array([0.05, 0.05, 5.0, 5.0])  # half-width of what the seed of goal_mpc.py adds to it
 
 ACTION_NAMES = ("F", "Q_dot")
 ACTION_UNITS = ("1/h", "kJ/h")
@@ -54,6 +58,8 @@ GOAL_REACHABLE = (np.array([0.31]), np.array([0.80]))  # at steady state, inside
 ERROR_SCALE = np.array([0.05])  # mol/l; five standard deviations of the training reward
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
+MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
+MPC_SIGMA2 = 0.01  # (mol/l)^2, of the stage cost in the authors' script; the paper's text says 0.0625
 
 K0_AB = 1.287e12  # 1/h, rate constants (Table 1)
 K0_AD = 9.043e9  # l/(mol h)

@@ -108,7 +108,7 @@ def plot(args):
         line = f"{variant:33s}"
         for ax, (key, title) in zip(axes, columns.items()):
             values = mine[key].astype(float)
-            colour = deploy.COLOURS[mine["controller"][0]]
+            colour = deploy.STYLES[mine["controller"][0]][0]
             ax.boxplot(values, positions=[-position], orientation="horizontal", widths=0.6, whis=(5, 95), showfliers=False,
                        medianprops=dict(color=colour, lw=2.5))  # fmt: skip
             jitter = np.random.default_rng(0).uniform(-0.2, 0.2, len(values))

@@ -43,7 +43,7 @@ class Args:
 
 def main(args):
     plant = envs.load("cstr")
-    settings = deploy.Args(goal=args.goal, steps=5 if args.quick else args.steps)
+    settings = deploy.Args(goal=(args.goal,), steps=5 if args.quick else args.steps)
     table, names = args.out / "results/cstr_profile.csv", [*plant.STATE_NAMES, *plant.ACTION_NAMES]
     if not args.plot_only:
         table.parent.mkdir(parents=True, exist_ok=True)

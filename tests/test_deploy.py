@@ -338,7 +338,7 @@ def test_horizon_zero_and_hard_constraints_from_the_command_line(checkpoint, tmp
         (["--horizon", "-1"], ["--horizon", "-1", "[0, "]),
         (["--episodes", "0"], ["--episodes", "0", "[1, "]),
         (["--steps", "-5"], ["--steps", "-5"]),
-        (["--goal", "3"], ["--goal", "3", "[0.1, 2]"]),
+        (["--goal", "3"], ["--goal", "3", "[0.1] to [2.]"]),
         (["--goal", "nan"], ["--goal", "nan"]),
         (["--critic", "no/such.pt"], ["--critic", "no/such.pt", "does not exist"]),
         (["--critic", "LICENSE"], ["--critic", "LICENSE", "not a checkpoint"]),

@@ -1,0 +1,144 @@
+"""Double inverted pendulum on a cart, the paper's Example 1: the benchmark of Fiedler et al. (2023), do-mpc's `DIP` example.
+
+A horizontal force moves a cart that carries two uniform rods in series. Angles are measured from the upright position, both against
+the vertical. The three masses are uncertain. Departures from the benchmark: the rods' accelerations are solved for (a symmetric 3 x 3
+mass matrix) where it hands an implicit system to a DAE solver, and its kinetic energy takes the first rod's angular rate in the second
+rod's rotational term, here corrected.
+"""
+
+import numpy as np
+
+from envs import rk4, stack
+
+ENV_ID = "RLMPC/DoublePendulum-v0"
+EPISODE_STEPS = 100
+DT = 0.04  # s, sampling time
+TIME_UNIT = "s"
+
+STATE_NAMES = ("position", "theta_1", "theta_2", "velocity", "omega_1", "omega_2")
+STATE_UNITS = ("m", "rad", "rad", "m/s", "rad/s", "rad/s")
+X_LOW = np.array([-5.0, -np.inf, -np.inf, -np.inf, -np.inf, -np.inf])  # the track is what limits the motion
+X_HIGH = -X_LOW
+INIT_LOW = np.array([-1.0, -np.pi, -np.pi, -1.0, -5.0, -5.0])
+INIT_HIGH = -INIT_LOW
+OBS_LOW = np.array([-200.0, -1000.0, -1000.0, -100.0, -200.0, -200.0])  # far beyond what 5 N and the initial energy reach in an episode
+OBS_HIGH = -OBS_LOW
+ANGLES = [1, 2]  # the networks see them as sine and cosine
+START = np.array([0.0, 0.9 * np.pi, 0.9 * np.pi, 0.0, 0.0, 0.0])  # the paper's: at rest, nearly hanging
+START_NOISE = np.array([0.0, 0.05, 0.05, 0.0, 0.0, 0.0])  # half-width of what the seed of goal_mpc.py adds to it
+
+ACTION_NAMES = ("force",)
+ACTION_UNITS = ("N",)
+U_LOW, U_HIGH = np.array([-5.0]), np.array([5.0])
+
+
+def _grid(factors):
+    return np.stack(np.meshgrid(factors, factors, factors, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+PSI_NAMES = ("cart_mass", "rod_1_mass", "rod_2_mass")  # factors of the nominal masses
+PSI_NOMINAL = np.ones(3)
+SCENARIOS = {
+    "nominal": PSI_NOMINAL[None],
+    "mpc": _grid([1.0, 0.95, 1.05]),  # nominal first
+    "extremes": np.concatenate([PSI_NOMINAL[None], _grid([0.95, 1.05])]),
+    "robust": _grid(np.linspace(0.95, 1.05, 10)),
+}
+EVAL_PSI = _grid(np.linspace(0.95, 1.05, 7))
+
+BENCHMARK = {"horizon": 25, "slack_price": 1e3 * np.ones((2, 6)), "change_weight": np.zeros(1)}  # the quadratic agent
+EXPERT_CHANGE_WEIGHT = np.array([0.1])  # 1/N^2, of the expert agent's penalty on changes of the force
+
+GOAL_INDEX = [1, 2]  # the goal is a pair of angles, rad
+GOALS = {"up-up": (0.0, 0.0), "up-down": (0.0, np.pi), "down-up": (np.pi, 0.0)}  # the unstable equilibria, inner rod first
+TRAIN_GOALS = np.array(list(GOALS.values()))
+EVAL_GOAL = np.array(GOALS["up-up"])
+GOAL_LOW, GOAL_HIGH = -np.pi * np.ones(2), np.pi * np.ones(2)
+GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)
+ERROR_SCALE = np.ones(2)  # not used: both goals are angles
+REWARD_SIGMA2 = 0.01  # of 1 - cos(error), eq:smoothreward in the paper's "time near goal"
+REWARD_TOLERANCE = 0.02  # 1 - cos of 0.2 rad
+MPC_SIGMA2 = 1.0  # eq:smoothreward as the stage cost of goal_mpc.py
+MODEL_SUBSTEPS = 1  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
+
+GRAVITY = 9.80665  # m/s^2
+CART_MASS, ROD_1_MASS, ROD_2_MASS = 0.6, 0.2, 0.2  # kg
+LENGTH_1, LENGTH_2 = 0.5, 0.5  # m, of the rods; their centres of mass are in the middle
+CENTRE_1, CENTRE_2 = LENGTH_1 / 2, LENGTH_2 / 2  # m
+
+
+def _masses(psi):
+    return CART_MASS * psi[0], ROD_1_MASS * psi[1], ROD_2_MASS * psi[2]
+
+
+def ode(x, u, psi, xp=np):
+    """Time derivative, per second. Components along the first axis: x (6, ...), u (1, ...), psi (3, ...); xp is numpy, torch or casadi."""
+    theta_1, theta_2, omega_1, omega_2 = x[1], x[2], x[4], x[5]
+    cart, rod_1, rod_2 = _masses(psi)
+    moment_1, moment_2 = rod_1 * CENTRE_1 + rod_2 * LENGTH_1, rod_2 * CENTRE_2  # kg m
+    coupling = rod_2 * CENTRE_2 * LENGTH_1  # kg m^2
+    sin_1, cos_1, sin_2, cos_2 = xp.sin(theta_1), xp.cos(theta_1), xp.sin(theta_2), xp.cos(theta_2)
+    sin_12, cos_12 = sin_1 * cos_2 - cos_1 * sin_2, cos_1 * cos_2 + sin_1 * sin_2
+    # mass matrix [[m00, m01, m02], [m01, m11, m12], [m02, m12, m22]] and generalised forces b; a rod's inertia is m L^2 / 12
+    m00, m01, m02 = cart + rod_1 + rod_2, moment_1 * cos_1, moment_2 * cos_2
+    m11 = rod_1 * (CENTRE_1**2 + LENGTH_1**2 / 12) + rod_2 * LENGTH_1**2
+    m12, m22 = coupling * cos_12, rod_2 * (CENTRE_2**2 + LENGTH_2**2 / 12)
+    b0 = u[0] + moment_1 * omega_1 * omega_1 * sin_1 + moment_2 * omega_2 * omega_2 * sin_2
+    b1 = moment_1 * GRAVITY * sin_1 - coupling * omega_2 * omega_2 * sin_12
+    b2 = moment_2 * GRAVITY * sin_2 + coupling * omega_1 * omega_1 * sin_12
+    # symmetric elimination, stable since the matrix is positive definite
+    l1, l2 = m01 / m00, m02 / m00
+    d11, d12, c1 = m11 - m01 * l1, m12 - m01 * l2, b1 - l1 * b0
+    l12 = d12 / d11
+    alpha_2 = (b2 - l2 * b0 - l12 * c1) / (m22 - m02 * l2 - d12 * l12)
+    alpha_1 = (c1 - d12 * alpha_2) / d11
+    return stack(xp, [x[3], omega_1, omega_2, (b0 - m01 * alpha_1 - m02 * alpha_2) / m00, alpha_1, alpha_2])
+
+
+def step(x, u, psi, substeps=8):
+    """State one sampling time later with u held. Batched over the leading axes: x (..., 6), u (..., 1), psi (..., 3) -> (..., 6)."""
+    x, u, psi = (np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi))
+    return np.moveaxis(rk4(ode, x, u, psi, DT, substeps), 0, -1).copy()
+
+
+def kinetic_energy(x, psi=PSI_NOMINAL, xp=np):
+    """Kinetic energy in J, x (6, ...) -> (...)."""
+    cart, rod_1, rod_2 = _masses(psi)
+    velocity, omega_1, omega_2 = x[3], x[4], x[5]
+    sin_1, cos_1, sin_2, cos_2 = xp.sin(x[1]), xp.cos(x[1]), xp.sin(x[2]), xp.cos(x[2])
+    across_1, along_1 = velocity + CENTRE_1 * omega_1 * cos_1, CENTRE_1 * omega_1 * sin_1
+    across_2 = velocity + LENGTH_1 * omega_1 * cos_1 + CENTRE_2 * omega_2 * cos_2
+    along_2 = LENGTH_1 * omega_1 * sin_1 + CENTRE_2 * omega_2 * sin_2
+    translation = cart * velocity**2 + rod_1 * (across_1**2 + along_1**2) + rod_2 * (across_2**2 + along_2**2)
+    return 0.5 * (translation + rod_1 * LENGTH_1**2 / 12 * omega_1**2 + rod_2 * LENGTH_2**2 / 12 * omega_2**2)
+
+
+def potential_energy(x, psi=PSI_NOMINAL, xp=np):
+    """Potential energy in J, zero with both rods level, x (6, ...) -> (...)."""
+    _, rod_1, rod_2 = _masses(psi)
+    height_1, height_2 = CENTRE_1 * xp.cos(x[1]), LENGTH_1 * xp.cos(x[1]) + CENTRE_2 * xp.cos(x[2])
+    return GRAVITY * (rod_1 * height_1 + rod_2 * height_2)
+
+
+def expert_cost(x, xp=np):
+    """Stage and terminal cost of the paper's expert agent, J: kinetic minus potential energy, which has no goal as its argument."""
+    return kinetic_energy(x, xp=xp) - potential_energy(x, xp=xp)
+
+
+def goal_error(achieved, goal, xp=np):
+    """Elementwise error whose squared norm enters the Gaussian reward: 1 - cos of the angles' differences (eq:smoothreward)."""
+    return 1 - xp.cos(achieved - goal)
+
+
+def percentage_error(achieved, goal):
+    """Mean absolute error of the two angles, shortest way round, in percent of pi, (..., 2) -> (...)."""
+    wrapped = (achieved - goal + np.pi) % (2 * np.pi) - np.pi
+    return 100 * np.abs(wrapped).mean(-1) / np.pi
+
+
+def skeleton(x):
+    """Cart, joint and tip in the plane, m, for drawing: x (..., 6) -> (..., 3, 2)."""
+    x = np.asarray(x)
+    cart = np.stack([x[..., 0], 0 * x[..., 0]], axis=-1)
+    joint = cart + LENGTH_1 * np.stack([np.sin(x[..., 1]), np.cos(x[..., 1])], axis=-1)
+    return np.stack([cart, joint, joint + LENGTH_2 * np.stack([np.sin(x[..., 2]), np.cos(x[..., 2])], axis=-1)], axis=-2)

@@ -1,0 +1,671 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["gymnasium==1.4.0", "casadi==3.8.2", "numpy", "tyro", "matplotlib", "tqdm"]
+# ///
+"""Goal-conditioned scenario MPC written out in CasADi: scenario tree, soft constraints, Gaussian objective (eq:multiMPCobj).
+
+    minimise over u   1/S sum_i { sum_{t=1}^{N} [ l(x_t^i, g_t) + w'eps_t^i + w2'(eps_t^i)^2 + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
+    subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi^i),   x_0^i = s,   x_t^i - eps_t^i in X,   u_t^i in U,   u_t^i = u_t^j while i and j
+                      share their history: to the end of the robust horizon, where the tree stops branching
+
+with the stage cost l chosen by `--objective` (the paper's Example 1) from the plant's goal error e, for the pendulum 1 - cos(theta - g):
+goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy.
+
+    python goal_mpc.py --env double_pendulum --objective goal --horizon 75          # swing both rods up and hold them
+    python goal_mpc.py --goal up-down down-up@100 up-up@200 --steps 300 --animate   # visit three unstable equilibria
+    python goal_mpc.py --env cstr --horizon 20 --robust-horizon 1                   # another plant, a tree of nine scenarios
+
+It writes `runs/{env}__goal_mpc__{seed}__{time}/`: results.csv (a row per seed), trajectories.npz, episode.png and, if asked to,
+episode.gif. Only the folder `envs/` is needed beside this file.
+"""
+
+import contextlib
+import csv
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import envs
+
+RADAU_DEGREE = 3
+METRIC_SIGMA2 = 0.01  # of time near goal, squared units of the plant's goal error
+COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+
+
+@dataclass(frozen=True)
+class Args:
+    env: str = "double_pendulum"
+    """the plant: NAME of a module envs/NAME.py"""
+    objective: Literal["expert", "quadratic", "goal"] = "goal"
+    """stage cost; expert: what the plant module defines (double_pendulum: kinetic minus potential energy)"""
+    horizon: int = 75
+    """prediction steps N"""
+    sigma2: float | None = None
+    """sigma^2 of the Gaussian objective, squared units of the goal error; default: the plant's (double_pendulum: 1, cstr: 0.01)"""
+    goal: tuple[str, ...] = ()
+    """a name (double_pendulum: up-up, up-down, down-up) or numbers joined by commas; @STEP after it: from that step on.
+    Default: the plant's evaluation goal"""
+    preview: bool = False
+    """tell the controller of goal changes that lie within its horizon; otherwise it learns of each when it happens"""
+    steps: int = 100
+    """sampling times per episode"""
+    episodes: int = 1
+    """episodes; their seeds are seed, seed + 1, ..."""
+    seed: int = 0
+    """seed of the first episode: it perturbs the start state and, with --plant random, draws the plant's parameters"""
+    plant: Literal["nominal", "random"] = "nominal"
+    """parameters of the simulated plant: the model's, or drawn per episode from the plant's evaluation set"""
+
+    robust_horizon: int = 0
+    """stages at which the scenario tree branches; 0: the nominal model alone"""
+    scenarios: str = "mpc"
+    """name of the plant's scenario set that the tree branches over"""
+    discretization: Literal["rk4", "radau"] = "rk4"
+    """prediction model: explicit Runge-Kutta steps, or Radau collocation of degree 3"""
+    constraints: Literal["soft", "hard"] = "soft"
+    """whether the state bounds may be violated at a price"""
+    slack_weight: float = 10.0
+    """L1 price of a violation, per physical unit and step"""
+    slack_weight_l2: float = 0.0
+    """price of its square"""
+    change_weight: tuple[float, ...] | None = None
+    """price of the squared change of each action; default: 0, or with --objective expert the plant's (double_pendulum: 0.1)"""
+
+    solver: Literal["ipopt", "fatrop"] = "ipopt"
+    """fatrop: faster on long horizons, fails more often; nominal problems (--robust-horizon 0) only"""
+    compile: bool = True
+    """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc)"""
+    animate: bool = False
+    """write episode.gif, with the predicted motion drawn faintly"""
+    out: Path | None = None
+    """folder of the results; default: runs/{env}__goal_mpc__{seed}__{time}"""
+
+
+# Scenario MPC
+
+
+def compiled_solver(plugin, nlp, options):
+    """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
+
+    The C code of the problem and its derivatives is compiled once and kept in a cache folder under a hash of source, compiler
+    and processor; it appears there by an atomic rename, so that parallel processes may race for it. Where anything of that
+    fails (no compiler, no place to write, a library that does not load), a notice is printed and None returned.
+    """
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
+    try:
+        if compiler is None:
+            raise OSError("no gcc, clang or cc")
+        version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
+        cpu = Path("/proc/cpuinfo")
+        processor = cpu.read_text().split("\n\n")[0].split("flags")[-1] if cpu.exists() else platform.processor()
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
+            ca.nlpsol("nlp", plugin, nlp, options("cold")).generate_dependencies("nlp.c")
+            source = Path("nlp.c").read_bytes()
+            key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
+            library = cache / f"{key}.so"
+            if not library.exists():
+                cache.mkdir(parents=True, exist_ok=True)
+                built = cache / f"{key}.{os.getpid()}"
+                subprocess.run([compiler, *COMPILER_FLAGS, "nlp.c", "-o", str(built), "-lm"], check=True, capture_output=True)
+                os.replace(built, library)
+        return {name: ca.nlpsol(name, plugin, str(library), options(name)) for name in ("cold", "warm")}
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
+        return None
+
+
+class ScenarioMPC:
+    """eq:multiMPCobj by multiple shooting over a scenario tree, with soft constraints and a goal that may change over the horizon.
+
+    stage_cost, terminal_cost: CasADi functions (x, goal) -> scalar, to be minimised; terminal_cost may be None.
+    scenarios: (S, n_psi); the first is the nominal one. robust_horizon: stages at which the tree branches, 0 = nominal.
+    slack_price, slack_price_l2: (2, n_x) or scalars, of a violation of X_LOW (first row) and X_HIGH and of its square, per physical
+    unit; an infinite slack_price makes a bound hard, 0 ignores it.
+    change_weight: (n_u,), price of the squared change of each action.
+    solver: "ipopt", or "fatrop" for robust_horizon = 0.
+    """
+
+    def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=0, discretization="rk4",
+                 slack_price=1.0, slack_price_l2=0.0, change_weight=None, solver="ipopt", tol=1e-6, compile=True):  # fmt: skip
+        if horizon < 1:
+            raise ValueError(f"horizon is {horizon}; it must be at least 1")
+        if solver == "fatrop" and robust_horizon:
+            raise ValueError("solver fatrop needs robust_horizon 0: its stages must have one node each")
+        self.plant, self.horizon, self.robust_horizon, self.discretization = plant, horizon, robust_horizon, discretization
+        self.scenarios = np.asarray(scenarios if robust_horizon else scenarios[:1])
+        self.stage_cost, self.terminal_cost = stage_cost, terminal_cost
+        self.n_x, self.n_u, self.n_goal = len(plant.X_LOW), len(plant.U_LOW), len(plant.GOAL_INDEX)
+        self.x_center, self.x_scale = (plant.INIT_LOW + plant.INIT_HIGH) / 2, (plant.INIT_HIGH - plant.INIT_LOW) / 2
+        self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
+        bounds = np.array([plant.X_LOW, plant.X_HIGH])
+        self.slack_price = np.where(np.isinf(bounds), 0.0, np.broadcast_to(slack_price, bounds.shape))
+        self.slack_price_l2 = np.broadcast_to(slack_price_l2, bounds.shape)
+        self.hard_bounds = np.where(np.isinf(self.slack_price), bounds, [[-np.inf], [np.inf]])
+        self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight, dtype=float)
+        self.solver = solver
+        self.lifted = solver == "fatrop" and self.change_weight.any()  # fatrop's stages must not reach back: carry u_{t-1} as a state
+        self._build_tree()
+        self._build_layout()
+        self._build_problem()
+        self._build_solvers(compile, tol)
+        self.set_goal(goal)
+        self.reset()
+
+    def _build_tree(self):
+        """nodes[t]: how many; over all nodes but the root: parent (a column among all nodes), stage, psi and weight."""
+        S, R = len(self.scenarios), self.robust_horizon
+        self.nodes = [S ** min(t, R) for t in range(self.horizon + 1)]
+        first = np.concatenate([[0], np.cumsum(self.nodes)])
+        order = [np.arange(n) for n in self.nodes]
+        self.parent = np.concatenate([first[t] + (order[t + 1] // S if t < R else order[t + 1]) for t in range(self.horizon)])
+        self.stage = np.repeat(np.arange(self.horizon + 1), self.nodes)  # of every node, the root included
+        self.psi = self.scenarios[np.concatenate(order[1:]) % S].T  # (n_psi, nodes)
+        self.weight = 1 / np.array(self.nodes)[self.stage]
+
+    def _build_layout(self):
+        """Where each block (name, stage) lies in w or g: stage after stage, as fatrop needs it and IPOPT does not mind."""
+        self.soft = [np.flatnonzero((price > 0) & np.isfinite(price)) for price in self.slack_price]  # states with slack below, above
+        self.index, self.size, slacks = {}, {"w": 0, "g": 0}, sum(map(len, self.soft))
+
+        def block(vector, name, t, rows, nodes):
+            """index[name][t]: (rows, nodes) positions."""
+            self.index.setdefault(name, {})[t] = self.size[vector] + np.arange(rows * nodes).reshape(nodes, rows).T
+            self.size[vector] += rows * nodes
+
+        for t, n in enumerate(self.nodes):
+            inner, n_next = t < self.horizon, self.nodes[min(t + 1, self.horizon)]
+            block("w", "x", t, self.n_x, n)
+            if self.lifted:
+                block("w", "u_before", t, self.n_u, n)
+            if inner:
+                block("w", "u", t, self.n_u, n)
+                block("g", "dynamics", t, self.n_x, n_next)
+                if self.lifted:
+                    block("g", "carried", t, self.n_u, n_next)
+                if self.discretization == "radau":
+                    block("w", "inside", t, self.n_x * RADAU_DEGREE, n_next)
+                    block("g", "collocation", t, self.n_x * RADAU_DEGREE, n_next)
+            if t == 0:
+                block("g", "start", t, self.n_x + (self.n_u if self.lifted else 0), 1)
+            else:
+                block("w", "slack", t, slacks, n)
+                block("g", "box", t, slacks, n)
+
+    def positions(self, name):
+        """Positions of the block `name` of all stages, (rows, nodes of all stages)."""
+        return np.hstack(list(self.index[name].values()))
+
+    def _build_problem(self):
+        """Variables, constraints and objective of the problem in the docstring, all nodes of the tree at once.
+
+        Everything is in units of the boxes of initial states and actions, but for what the cost and model functions see.
+        """
+        w, x_now, u_now = ca.MX.sym("w", self.size["w"]), ca.MX.sym("x_now", self.n_x), ca.MX.sym("u_now", self.n_u)
+        goal = ca.MX.sym("goal", self.n_goal, self.horizon)  # a column per stage 1 ... N
+        lbw, ubw = np.full(self.size["w"], -np.inf), np.full(self.size["w"], np.inf)
+        g, J, children, stage = [], 0, slice(1, None), self.stage[1:]
+
+        def variable(name, low=-np.inf, high=np.inf):
+            at = self.positions(name)
+            lbw[at], ubw[at] = np.transpose([low]), np.transpose([high])
+            return ca.reshape(w[at.ravel("F").tolist()], *at.shape)
+
+        # u_t at every node that has children, and x_t at every node; hard bounds from x_1 on: x_0 is measured
+        u = variable("u", -np.ones(self.n_u), np.ones(self.n_u)) * self.u_scale + self.u_center
+        x_scaled = variable("x", *((self.hard_bounds - self.x_center) / self.x_scale))
+        lbw[self.index["x"][0]], ubw[self.index["x"][0]] = -np.inf, np.inf
+        x = x_scaled * self.x_scale + self.x_center
+        parents = self.parent.tolist()
+        # x_0 = s, x_{t+1} = f(x_t, u_t, psi)
+        start = [(x[:, 0] - x_now) / self.x_scale]
+        model, n = self._model(), len(parents)
+        if self.discretization == "radau":
+            inside = variable("inside")
+            x_next, residual = model.map(n)(x[:, parents], u[:, parents], self.psi, inside)
+            g.append(("collocation", residual))
+        else:
+            x_next = model.map(n)(x[:, parents], u[:, parents], self.psi)
+        g.append(("dynamics", x_scaled[:, children] - (x_next - self.x_center) / self.x_scale))
+        # X_LOW <= x + below, x - above <= X_HIGH, slack >= 0, with its price
+        weight = ca.DM(self.weight[children]).T
+        if self.positions("slack").size:
+            slack, (below, above) = variable("slack", 0.0), self.soft
+            scale = np.concatenate([self.x_scale[below], self.x_scale[above]])
+            edges = [(self.plant.X_LOW - self.x_center) / self.x_scale, (self.x_center - self.plant.X_HIGH) / self.x_scale]
+            distance = ca.vertcat(x_scaled[below.tolist(), children], -x_scaled[above.tolist(), children])
+            g.append(("box", distance + slack - np.concatenate([edges[0][below], edges[1][above]])))
+            price, price_l2 = (np.concatenate([p[0][below], p[1][above]]) for p in (self.slack_price, self.slack_price_l2))
+            J += weight @ (ca.DM(price * scale).T @ slack + ca.DM(price_l2 * scale**2).T @ slack**2).T
+        # stage cost at x_1 ... x_N, terminal cost at every leaf
+        J += weight @ self.stage_cost.map(n)(x[:, children], goal[:, (stage - 1).tolist()]).T
+        if self.terminal_cost is not None:
+            leaves = np.flatnonzero(self.stage == self.horizon).tolist()
+            J += ca.sum2(self.terminal_cost.map(len(leaves))(x[:, leaves], ca.repmat(goal[:, -1], 1, len(leaves)))) / len(leaves)
+        # change of the actions
+        if self.change_weight.any():
+            before = self.parent[: u.shape[1] - 1].tolist()  # the parent of every node with children, but for the root
+            u_before = ca.horzcat(u_now, u[:, before])
+            if self.lifted:
+                carried = variable("u_before") * self.u_scale + self.u_center
+                g.append(("carried", (carried[:, children] - u[:, parents]) / self.u_scale))
+                start.append((carried[:, 0] - u_now) / self.u_scale)
+                u_before = carried[:, : u.shape[1]]
+            J += ca.DM(self.weight[: u.shape[1]]).T @ (ca.DM(self.change_weight).T @ (u - u_before) ** 2).T
+        g.append(("start", ca.vertcat(*start)))
+        order = np.argsort(np.concatenate([self.positions(name).ravel("F") for name, _ in g]))
+        self.nlp = {"x": w, "p": ca.veccat(x_now, u_now, goal), "f": J, "g": ca.veccat(*(value for _, value in g))[order.tolist()]}
+        ubg = np.zeros(self.size["g"])
+        ubg[self.positions("box")] = np.inf
+        self.bounds = {"lbx": lbw, "ubx": ubw, "lbg": np.zeros_like(ubg), "ubg": ubg}
+
+    def _model(self):
+        """Prediction over one sampling time: (x, u, psi) -> x_next, or by collocation (x, u, psi, inside) -> x_next, residual."""
+        plant, dt = self.plant, self.plant.DT
+        x, u, psi = (ca.MX.sym(name, rows) for name, rows in (("x", self.n_x), ("u", self.n_u), ("psi", self.scenarios.shape[1])))
+        xs, us, psis = (ca.SX.sym(v.name(), v.numel()) for v in (x, u, psi))
+        if self.discretization == "rk4":
+            # one substep is the unit that is differentiated and compiled: unrolled, several take several times as long to compile
+            h = dt / plant.MODEL_SUBSTEPS
+            substep = ca.Function("substep", [xs, us, psis], [envs.rk4(plant.ode, xs, us, psis, h, 1, ca)], {"never_inline": True})
+            x_next = x
+            for _ in range(plant.MODEL_SUBSTEPS):
+                x_next = substep(x_next, u, psi)
+            return ca.Function("step", [x, u, psi], [x_next], {"never_inline": True})
+        # states at the collocation points 0 < tau_1 < ... < tau_d = 1 interpolate a polynomial that satisfies the ODE there
+        derivative = ca.collocation_coeff(ca.collocation_points(RADAU_DEGREE, "radau"))[0]  # (d + 1, d)
+        inside = ca.SX.sym("inside", self.n_x * RADAU_DEGREE)
+        points = ca.reshape(inside, self.n_x, RADAU_DEGREE) * self.x_scale + self.x_center
+        slopes = ca.horzcat(xs, points) @ derivative
+        field = ca.horzcat(*(plant.ode(points[:, j], us, psis, ca) for j in range(RADAU_DEGREE)))
+        residual = ca.vec((slopes - dt * field) / self.x_scale)
+        return ca.Function("collocation", [xs, us, psis, inside], [points[:, -1], residual], {"never_inline": True})
+
+    def _build_solvers(self, compile, tol):
+        """The solver twice on the same functions: from scratch, and (IPOPT) from a nearby solution with its multipliers."""
+        cold = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 500, "bound_relax_factor": 0.0}
+        warm = cold | {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
+                       "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
+
+        def options(name):
+            common = {"print_time": False, "show_eval_warnings": False}
+            if self.solver == "ipopt":
+                return common | {"ipopt": warm if name == "warm" else cold}
+            structure = {"structure_detection": "auto", "equality": (self.bounds["ubg"] == 0).tolist()}
+            return common | structure | {"fatrop": {"print_level": 0, "tol": tol, "max_iter": 500}}
+
+        self.solvers = compiled_solver(self.solver, self.nlp, options) if compile else None
+        self.compiled = self.solvers is not None
+        if not self.compiled:
+            self.solvers = {name: ca.nlpsol(name, self.solver, self.nlp, options(name)) for name in ("cold", "warm")}
+        # shifting by one sampling time: block (name, t) takes what stands at (name, t + 1), channel by channel
+        self.shift = {"w": np.arange(self.size["w"]), "g": np.arange(self.size["g"])}
+        for name, stages in self.index.items():
+            shift = self.shift["g" if name in ("dynamics", "carried", "collocation", "box") else "w"]
+            for t, here in stages.items():
+                if t + 1 in stages and name != "start":
+                    shift[here] = stages[t + 1][:, : here.shape[1]]  # under the first scenarios, where the tree branches
+
+    def reset(self):
+        """Forget the previous plan and the last action, as at the start of an episode."""
+        self.u_before = np.zeros(self.n_u)  # do-mpc's convention for the input-change penalty
+        self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
+        self.plan_left = 0  # actions that it still holds
+        self.last_w = None
+        self.stats = {}
+
+    def set_goal(self, goal):
+        """The goal from now on: (n_goal,), or (n_goal, N) for one that changes over the horizon, a column per stage 1 ... N."""
+        goal = np.asarray(goal, dtype=float)
+        if goal.shape not in ((self.n_goal,), (self.n_goal, self.horizon)) or not np.isfinite(goal).all():
+            raise ValueError(f"goal is {goal}; it must be finite, of shape ({self.n_goal},) or ({self.n_goal}, {self.horizon})")
+        self.goal = np.broadcast_to(goal.reshape(self.n_goal, -1), (self.n_goal, self.horizon))
+
+    def set_initial_guess(self, x0):
+        """Forget the previous plan: the next solve starts from `hold_guess`."""
+        envs.checked_state(self.plant, x0)
+        self.plan, self.plan_left = None, 0
+
+    def hold_guess(self, x0):
+        """w with the start state held at every node and the middle action."""
+        w = np.zeros(self.size["w"])
+        scaled = (x0 - self.x_center) / self.x_scale
+        w[self.positions("x")] = scaled[:, None]
+        if self.discretization == "radau":
+            w[self.positions("inside")] = np.tile(scaled, RADAU_DEGREE)[:, None]
+        return w
+
+    def drift_guess(self, x0):
+        """w with the last action held, and the nominal motion under it."""
+        w, x = self.hold_guess(x0), np.asarray(x0)
+        w[self.positions("u")] = ((self.u_before - self.u_center) / self.u_scale)[:, None]
+        for t in range(1, self.horizon + 1):
+            x = self.plant.step(x, self.u_before, self.scenarios[0])
+            w[self.index["x"][t]] = ((x - self.x_center) / self.x_scale)[:, None]
+        return w
+
+    def physical(self, w, name, t):
+        """States ("x") or actions ("u") of stage t in w, physical units, (rows, nodes)."""
+        center, scale = (self.x_center, self.x_scale) if name == "x" else (self.u_center, self.u_scale)
+        return w[self.index[name][t]] * scale[:, None] + center[:, None]
+
+    def _solve(self, which, x0, guess, lam_x=0, lam_g=0):
+        """One call of the solver: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
+        guess = guess.copy()
+        guess[self.index["x"][0][:, 0]] = (x0 - self.x_center) / self.x_scale
+        parameters = np.concatenate([x0, self.u_before, self.goal.ravel("F")])
+        result = self.solvers[which](x0=guess, p=parameters, lam_x0=lam_x, lam_g0=lam_g, **self.bounds)
+        self.last_objective = float(result["f"])
+        stats = self.solvers[which].stats()
+        self.stats["status"] = str(stats["return_status"])
+        self.stats["iterations"] += stats["iter_count"]
+        if not stats["success"] or not np.isfinite(self.last_objective):
+            return None
+        return tuple(np.array(result[key]).ravel() for key in ("x", "lam_x", "lam_g"))
+
+    def make_step(self, x0):
+        """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
+
+        Ladder: a solve from the shifted previous plan, or at first from `hold_guess`; if it does not succeed, one more from a cold guess
+        that was not tried yet; then the next action of the last successful plan, while it lasts; then the last action. `stats` says which.
+        """
+        x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
+        self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
+        if self.plan is None:
+            solution, other = self._solve("cold", x0, self.hold_guess(x0)), self.drift_guess
+        else:
+            solution, other = self._solve("warm", x0, *self.plan), self.hold_guess
+        if solution is None:
+            self.stats |= {"success": False, "rung": "retry"}
+            solution = self._solve("cold", x0, other(x0))
+        if solution is not None:
+            self.last_w, self.plan_left = solution[0], self.horizon
+        elif self.plan_left > 0:
+            self.stats["rung"], solution = "plan", self.plan
+        if solution is not None:
+            self.u_before = np.clip(self.physical(solution[0], "u", 0)[:, 0], self.plant.U_LOW, self.plant.U_HIGH)
+            self.plan = tuple(v[self.shift[vector]] for v, vector in zip(solution, ("w", "w", "g")))
+            self.plan_left -= 1
+        else:
+            self.stats["rung"], self.plan = "hold", None
+        self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
+        return self.u_before.copy()
+
+    def prediction(self):
+        """The last successful plan, physical units: lists over stages of states (n_x, nodes) from x_1 on and of actions (n_u, nodes)."""
+        if self.last_w is None:
+            raise ValueError("there is no prediction before the first successful make_step")
+        stages = range(self.horizon)
+        return {"x": [self.physical(self.last_w, "x", t + 1) for t in stages], "u": [self.physical(self.last_w, "u", t) for t in stages]}
+
+
+# Goals and objective
+
+
+def goal_schedule(plant, texts, steps):
+    """The goal at each of x_1 ... x_steps, (steps, n_goal), from texts such as ("up-up", "0,3.14@100"). Raises ValueError, one sentence."""
+    named, first, goal = getattr(plant, "GOALS", {}), 0, np.empty((steps, len(plant.GOAL_INDEX)))
+    for position, text in enumerate(texts or [",".join(map(str, plant.EVAL_GOAL))]):
+        value, _, when = text.partition("@")
+        try:
+            start = int(when) if when or position else 0
+            target = np.array(named[value] if value in named else [float(number) for number in value.split(",")])
+        except ValueError:
+            start, target = -1, np.empty(0)
+        if start < first + (position > 0) or target.shape != plant.EVAL_GOAL.shape:
+            names = f"one of {', '.join(named)}, or " if named else ""
+            numbers = f"{len(plant.EVAL_GOAL)} number(s) joined by commas, all but the first followed by @STEP in increasing order"
+            raise ValueError(f"--goal {text} is not a goal of {plant.ENV_ID}; it must be {names}{numbers}")
+        if not ((plant.GOAL_LOW <= target) & (target <= plant.GOAL_HIGH)).all():
+            raise ValueError(f"--goal {text} is out of range; it must lie in {plant.GOAL_LOW} to {plant.GOAL_HIGH}")
+        goal[start:], first = target, start
+    return goal
+
+
+def stage_cost(plant, objective, sigma2=None):
+    """CasADi function (x, goal) -> cost of `--objective`. Raises ValueError if the plant does not define it."""
+    x, goal = ca.SX.sym("x", len(plant.X_LOW)), ca.SX.sym("goal", len(plant.GOAL_INDEX))
+    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], goal, ca))
+    if objective == "expert":
+        if not hasattr(plant, "expert_cost"):
+            raise ValueError(f"--objective expert is not defined for {plant.ENV_ID}; choose quadratic or goal")
+        cost = plant.expert_cost(x, ca)
+    else:
+        sigma2 = plant.MPC_SIGMA2 if sigma2 is None else sigma2
+        cost = -ca.exp(-squared_error / (2 * sigma2)) if objective == "goal" else squared_error / 2
+    return ca.Function("stage", [x, goal], [cost], {"never_inline": True})
+
+
+def build_controller(args):
+    """The controller that the arguments describe, for the plant's evaluation goal."""
+    plant = envs.load(args.env)
+    change_weight = args.change_weight
+    if change_weight is None and args.objective == "expert":
+        change_weight = getattr(plant, "EXPERT_CHANGE_WEIGHT", None)
+    hard = args.constraints == "hard"
+    return ScenarioMPC(plant, args.horizon, plant.SCENARIOS[args.scenarios], stage_cost(plant, args.objective, args.sigma2),
+                       goal=plant.EVAL_GOAL, robust_horizon=args.robust_horizon, discretization=args.discretization,
+                       slack_price=np.inf if hard else args.slack_weight, slack_price_l2=args.slack_weight_l2,
+                       change_weight=change_weight, solver=args.solver, compile=args.compile)  # fmt: skip
+
+
+# Closed loop
+
+
+def simulate(mpc, x0, psi, goals, preview=False, progress=None):
+    """One episode on a plant with fixed parameters psi under goals (steps, n_goal).
+
+    Returns x (steps + 1, n_x), u (steps, n_u), the predictions under the nominal scenario (steps, N + 1, n_x) and the controller's stats.
+    """
+    mpc.reset()
+    mpc.set_initial_guess(x0)
+    x, u, predicted, log = [np.asarray(x0, dtype=float)], [], [], []
+    for t in range(len(goals)):
+        ahead = np.minimum(t + np.arange(mpc.horizon), len(goals) - 1) if preview else np.full(mpc.horizon, t)
+        mpc.set_goal(goals[ahead].T)
+        u.append(mpc.make_step(x[-1]))
+        log.append(mpc.stats)
+        tail = [s[:, 0] for s in mpc.prediction()["x"]] if mpc.stats["rung"] in ("solved", "retry") else [x[-1]] * mpc.horizon
+        predicted.append([x[-1], *tail])
+        x.append(mpc.plant.step(x[-1], u[-1], psi))
+        if progress is not None:
+            progress.update()
+    return np.array(x), np.array(u), np.array(predicted), log
+
+
+def summary(plant, x, u, goals, log):
+    """The measures of an episode: time near goal over x_1 ..., sum of absolute changes of the actions from 0 on, solve times, failures."""
+    milliseconds = np.array([s["wall_ms"] for s in log])
+    row = {
+        "time_near_goal": envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=METRIC_SIGMA2).sum(),
+        "action_total_variation": np.abs(np.diff(u, axis=0, prepend=0.0)).sum(),
+        "solve_ms_median": np.median(milliseconds),
+        "solve_ms_p95": np.quantile(milliseconds, 0.95),
+        "solve_ms_max": milliseconds.max(),
+    }
+    return {name: round(float(value), 6) for name, value in row.items()} | {"solver_failures": sum(not s["success"] for s in log)}
+
+
+def start_and_plant(plant, seed, random_plant):
+    """Start state (n_x,) and plant parameters (n_psi,) of the episode with this seed."""
+    rng = np.random.default_rng([seed, 4])
+    x0 = plant.START + plant.START_NOISE * rng.uniform(-1, 1, size=len(plant.START))
+    return x0, rng.choice(plant.EVAL_PSI) if random_plant else plant.PSI_NOMINAL
+
+
+# Table, figure, animation
+
+
+def table(rows):
+    """The episodes as text, and their median."""
+    columns = {"time_near_goal": "near goal", "action_total_variation": "action TV", "solve_ms_median": "ms median", "solve_ms_p95": "p95",
+               "solve_ms_max": "max", "solver_failures": "failed"}  # fmt: skip
+    lines = ["seed    " + "".join(f"{title:>11s}" for title in columns.values())]
+    lines += [f"{row['seed']:<8d}" + "".join(f"{row[key]:11.1f}" for key in columns) for row in rows]
+    if len(rows) > 1:
+        lines.append("median  " + "".join(f"{np.median([row[key] for row in rows]):11.1f}" for key in columns))
+    return "\n".join(lines)
+
+
+def wrapped(angle):
+    """Angles moved into [-pi/2, 3 pi/2), so that neither upright (0) nor hanging (pi) is at the edge; jumps are cut by NaN."""
+    angle = (np.asarray(angle) + np.pi / 2) % (2 * np.pi) - np.pi / 2
+    return np.where(np.abs(np.diff(angle, prepend=angle[:1])) > np.pi, np.nan, angle)
+
+
+def figure(plant, x, u, goals, path):
+    """Trajectory of one episode: a panel per goal state, constrained state and action, with bounds and goal."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    n_x, time_axis = len(plant.X_LOW), np.arange(len(x)) * plant.DT
+    low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
+    titles = [f"{n} [{v}]" for n, v in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
+    shown = [i for i in range(len(low)) if i in plant.GOAL_INDEX or np.isfinite(low[i])]
+    values = np.hstack([x, np.vstack([u, u[-1:]])])
+    fig, axes = plt.subplots(len(shown), 1, figsize=(8, 0.7 + 1.5 * len(shown)), sharex=True, layout="constrained", squeeze=False)
+    for ax, i in zip(axes.ravel(), shown):
+        angle = i in plant.ANGLES
+        if i in plant.GOAL_INDEX:
+            goal = goals[:, plant.GOAL_INDEX.index(i)]
+            goal = np.append(goal[:1], goal)  # goals are those of x_1 ...
+            ax.plot(time_axis, wrapped(goal) if angle else goal, color="#CC79A7", lw=2, ls=(0, (1, 1)), drawstyle="steps-pre", label="goal")
+        drawn = wrapped(values[:, i]) if angle else values[:, i]
+        ax.plot(time_axis, drawn, color="#0072B2", lw=1.8, drawstyle="default" if i < n_x else "steps-post", label="closed loop")
+        for bound in filter(np.isfinite, (low[i], high[i])):
+            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
+        if angle:
+            ax.set_yticks([0, np.pi], ["0 (up)", "π (down)"])
+            ax.set_ylim(-np.pi / 2 - 0.1, 3 * np.pi / 2 + 0.1)
+        ax.set_title(titles[i], fontsize=10, loc="left")
+    axes[-1, 0].set_xlabel(f"time [{plant.TIME_UNIT}]")
+    handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
+    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
+    fig.savefig(path, dpi=150)
+    plt.close(fig)
+
+
+def animate(plant, x, u, predicted, goals, path, every=2):
+    """GIF of the motion in real time, a frame per `every` steps; the predicted motion is drawn faintly, the goal dotted."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    fig, ax = plt.subplots(figsize=(6, 3.9), layout="constrained")
+    (ghosts,) = ax.plot([], [], color="#56B4E9", lw=1, alpha=0.6)
+    (target,) = ax.plot([], [], ":", color="#CC79A7", lw=3)
+    (rods,) = ax.plot([], [], "-o", color="#0072B2", lw=4, ms=6)
+    (cart,) = ax.plot([], [], "s", color="black", ms=16)
+    (force,) = ax.plot([], [], color="#D55E00", lw=5)
+    clock = ax.text(0.02, 0.93, "", transform=ax.transAxes)
+    ax.legend([rods, ghosts, target, force], ["rods", "prediction", "goal", "force"], loc="upper right", ncols=4, fontsize=8, frameon=False)
+    ax.set(ylim=(-1.2, 1.5), aspect="equal", xlabel="position [m]", yticks=[])
+    ax.axhline(0, color="grey", lw=1, zorder=0)
+    view = np.convolve(np.pad(plant.skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid")  # the camera follows the cart
+
+    def draw(t):
+        points = plant.skeleton(x[t])
+        step = max(predicted.shape[1] // 12, 1)
+        faint = plant.skeleton(predicted[t, ::step])
+        ghosts.set_data(*np.concatenate([np.vstack([p, [[np.nan, np.nan]]]) for p in faint]).T)
+        aim = x[t].copy()
+        aim[plant.GOAL_INDEX] = goals[t]
+        target.set_data(*plant.skeleton(aim).T)
+        rods.set_data(*points.T)
+        cart.set_data(points[:1, 0], points[:1, 1])
+        force.set_data([points[0, 0], points[0, 0] + 0.15 * u[t, 0]], [-0.2, -0.2])
+        ax.set_xlim(view[t] - 2.2, view[t] + 2.2)
+        clock.set_text(f"t = {t * plant.DT:4.1f} {plant.TIME_UNIT}")
+
+    frames = range(0, len(u), every)
+    FuncAnimation(fig, draw, frames=frames).save(path, writer=PillowWriter(fps=round(1 / (every * plant.DT), 2)), dpi=80)
+    plt.close(fig)
+
+
+def fail(message):
+    """A user's mistake: one sentence, exit code 2, no traceback."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def check(args):
+    """Refuse arguments that cannot work, before anything long starts; returns plant and goals (steps, n_goal)."""
+    ranges = {"horizon": (1, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "seed": (0, 10**9),
+              "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6), "slack_weight_l2": (0, 1e6)}  # fmt: skip
+    for name, (least, most) in ranges.items():
+        value = getattr(args, name)
+        if value is not None and not least <= value <= most:  # catches nan too
+            fail(f"--{name.replace('_', '-')} is {value}; it must lie in [{least:g}, {most:g}]")
+    try:
+        plant = envs.load(args.env)
+        stage_cost(plant, args.objective)
+        goals = goal_schedule(plant, args.goal, args.steps)
+    except ValueError as error:
+        fail(error)
+    if args.scenarios not in plant.SCENARIOS:
+        fail(f"--scenarios {args.scenarios} is not a scenario set of {args.env}; choose one of {', '.join(plant.SCENARIOS)}")
+    leaves = len(plant.SCENARIOS[args.scenarios]) ** min(args.robust_horizon, args.horizon)
+    if leaves > 1000:
+        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
+    if args.solver == "fatrop" and args.robust_horizon:
+        fail(f"--solver fatrop solves nominal problems only; --robust-horizon is {args.robust_horizon}, it must be 0")
+    weights = args.change_weight
+    if weights is not None and not (len(weights) == len(plant.U_LOW) and all(0 <= weight < np.inf for weight in weights)):
+        fail(f"--change-weight is {weights}; it needs {len(plant.U_LOW)} number(s), each at least 0")
+    if args.animate and not hasattr(plant, "skeleton"):
+        fail(f"--animate needs a plant that can be drawn; {args.env} defines no skeleton")
+    return plant, goals
+
+
+def main(args):
+    plant, goals = check(args)
+    out = args.out or Path("runs") / f"{args.env}__goal_mpc__{args.seed}__{int(time.time())}"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "results.csv").touch()
+    except OSError as error:
+        fail(f"--out {out}: cannot write there ({error.strerror})")
+    tick = time.perf_counter()
+    mpc = build_controller(args)
+    print(f"{plant.ENV_ID}: {mpc.size['w']} variables, {mpc.size['g']} constraints, built in {time.perf_counter() - tick:.1f} s")
+    rows, episodes = [], []
+    with tqdm(total=args.episodes * args.steps, unit="step", disable=None) as bar:
+        for seed in range(args.seed, args.seed + args.episodes):
+            x0, psi = start_and_plant(plant, seed, args.plant == "random")
+            x, u, predicted, log = simulate(mpc, x0, psi, goals, args.preview, bar)
+            rows.append(
+                {"env": args.env, "objective": args.objective, "horizon": args.horizon, "seed": seed} | summary(plant, x, u, goals, log)
+            )
+            episodes.append((x, u, predicted))
+    with open(out / "results.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    np.savez_compressed(out / "trajectories.npz", goals=goals, **{k: np.stack([e[i] for e in episodes]) for i, k in enumerate("xu")})
+    figure(plant, *episodes[0][:2], goals, out / "episode.png")
+    if args.animate:
+        animate(plant, *episodes[0], goals, out / "episode.gif")
+    print(table(rows))
+    print(", ".join(str(path) for path in sorted(out.iterdir())))
+    return rows
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

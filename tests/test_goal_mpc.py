@@ -1,0 +1,393 @@
+"""goal_mpc.py against Riccati, against what must hold of a scenario tree, against its twin, the failure ladder, and the command line."""
+
+import csv
+import shutil
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+import goal_mpc as gm
+import rl_mpc_deploy as deploy
+from envs import cstr
+from envs import double_pendulum as dp
+
+ROOT = Path(__file__).parent.parent
+CSTR_X0 = np.array([0.8, 0.5, 134.14, 130.0])
+NEAR_UPRIGHT = np.array([0.1, 0.1, 0.05, 0.0, 0.0, 0.0])  # one basin: other local optima are far
+CHAIN = np.array([[0.0, 1.0], [0.3, -0.2]])  # x' = CHAIN x + [0, psi] u
+
+
+def linear_plant(u_max=100.0, x_max=np.inf):
+    """A double integrator's cousin as a plant module, exactly discretised by enough Runge-Kutta steps."""
+    plant = SimpleNamespace(ENV_ID="linear", STATE_NAMES=("a", "b"), DT=0.1, MODEL_SUBSTEPS=10, GOAL_INDEX=[0], X_LOW=np.full(2, -x_max),
+                            X_HIGH=np.full(2, x_max), INIT_LOW=-np.ones(2), INIT_HIGH=np.ones(2), U_LOW=np.array([-u_max]),
+                            U_HIGH=np.array([u_max]))  # fmt: skip
+
+    def ode(x, u, psi, xp):
+        a, b = CHAIN[0, 0] * x[0] + CHAIN[0, 1] * x[1], CHAIN[1, 0] * x[0] + CHAIN[1, 1] * x[1] + psi[0] * u[0]
+        return ca.vertcat(a, b) if xp is ca else np.array([a, b])
+
+    plant.ode = ode
+    plant.step = lambda x, u, psi: gm.envs.rk4(ode, np.asarray(x, float), np.atleast_1d(u), np.asarray(psi), 0.1, 10)
+    return plant
+
+
+def quadratic(plant, Q, P=None):
+    x, g = ca.SX.sym("x", 2), ca.SX.sym("g", 1)
+    cost = ca.Function("q", [x, g], [x.T @ Q @ x])
+    return cost, None if P is None else ca.Function("p", [x, g], [x.T @ (P - Q) @ x])
+
+
+def pendulum(horizon=12, objective="goal", **options):
+    """The controller with one of the paper's objectives, or with "steep": quadratic in the state, so that optima are sharp."""
+    x, g = ca.SX.sym("x", 6), ca.SX.sym("g", 2)
+    steep = ca.Function("steep", [x, g], [ca.sumsqr(x[1:3] - g) + 0.1 * ca.sumsqr(x)])
+    stage = steep if objective == "steep" else gm.stage_cost(dp, objective)
+    settings = dict(goal=dp.EVAL_GOAL, compile=False) | options
+    return gm.ScenarioMPC(dp, horizon, settings.pop("scenarios", dp.SCENARIOS["mpc"]), stage, **settings)
+
+
+def first_solve(controller, x0):
+    controller.reset()
+    controller.set_initial_guess(x0)
+    u = controller.make_step(x0)
+    assert controller.stats["rung"] == "solved", controller.stats
+    return controller.last_objective, u
+
+
+# The optimal control problem
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+@pytest.mark.parametrize("discretization", ["rk4", "radau"])
+def test_linear_quadratic_problem_has_riccatis_solution(solver, discretization):
+    """Input price through the change penalty: with the previous input as a state, the problem is linear-quadratic in (x, u_before)."""
+    plant, Q, R = linear_plant(), np.diag([1.0, 0.1]), 0.05
+    columns = [plant.step(e[:2], e[2:], [1.0]) for e in np.eye(3)]
+    A, B = np.column_stack(columns[:2]), columns[2][:, None]
+    # state (x, v) with v the previous input: x' = A x + B u, v' = u, cost x'^T Q x' + R (u - v)^2 at every step
+    AA, BB = np.block([[A, np.zeros((2, 1))], [np.zeros((1, 3))]]), np.vstack([B, [[1.0]]])
+    QQ, RR = np.block([[A.T @ Q @ A, np.zeros((2, 1))], [np.zeros((1, 2)), R * np.eye(1)]]), B.T @ Q @ B + R
+    S = np.vstack([A.T @ Q @ B, [[-R]]])
+    P = solve_discrete_are(AA, BB, QQ, RR, s=S)
+    K = np.linalg.solve(RR + BB.T @ P @ BB, BB.T @ P @ AA + S.T)
+    mpc = gm.ScenarioMPC(plant, 80, np.ones((1, 1)), quadratic(plant, Q)[0], goal=[0.0], change_weight=[R], solver=solver,
+                         discretization=discretization, compile=False, tol=1e-9)  # fmt: skip
+    x0 = np.array([0.7, -0.4])
+    objective, u = first_solve(mpc, x0)
+    start = np.append(x0, 0.0)
+    assert objective == pytest.approx(start @ P @ start, rel=1e-6)
+    np.testing.assert_allclose(u, -K @ start, rtol=1e-5)
+
+
+def test_both_solvers_and_both_discretizations_agree_on_the_pendulum():
+    x0 = NEAR_UPRIGHT
+    reference = first_solve(pendulum(20, "steep", robust_horizon=0), x0)
+    for options in (dict(solver="fatrop"), dict(discretization="radau"), dict(solver="fatrop", discretization="radau")):
+        objective, u = first_solve(pendulum(20, "steep", robust_horizon=0, **options), x0)
+        assert objective == pytest.approx(reference[0], rel=1e-3), options
+        np.testing.assert_allclose(u, reference[1], atol=0.05)
+
+
+def test_identical_scenarios_and_one_scenario_give_the_nominal_controller():
+    x0 = NEAR_UPRIGHT
+    nominal = first_solve(pendulum(objective="steep", robust_horizon=0, tol=1e-9), x0)
+    for scenarios in (np.ones((3, 3)), np.ones((1, 3))):
+        objective, u = first_solve(pendulum(objective="steep", scenarios=scenarios, robust_horizon=1, tol=1e-9), x0)
+        assert objective == pytest.approx(nominal[0], rel=1e-6)
+        np.testing.assert_allclose(u, nominal[1], atol=1e-3)
+
+
+def test_a_tree_that_branches_twice():
+    """Nodes, parents and scenarios of every stage, by following the prediction with the plant's own equations."""
+    controller = pendulum(3, scenarios=dp.SCENARIOS["mpc"][[0, 5]], robust_horizon=2)
+    assert controller.nodes == [1, 2, 4, 4]
+    x0 = NEAR_UPRIGHT
+    first_solve(controller, x0)
+    predicted = controller.prediction()
+    states = [x0[:, None], *predicted["x"]]
+    for t in range(3):
+        for j in range(controller.nodes[t + 1]):
+            parent = j // 2 if t < 2 else j
+            expected = dp.step(states[t][:, parent], predicted["u"][t][:, parent], controller.scenarios[j % 2], dp.MODEL_SUBSTEPS)
+            np.testing.assert_allclose(states[t + 1][:, j], expected, atol=1e-6)
+
+
+def test_robust_problem_equals_its_twin_in_the_deployed_controller():
+    """The same tree, model, Gaussian cost, L1 slack: rl_mpc_deploy.py without a critic."""
+    x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
+    stage = ca.Function("stage", [x, g], [-ca.exp(-((x[1] - g) ** 2) / 0.02)])
+    zero = ca.Function("zero", [x, g], [0])
+    for x0 in (CSTR_X0, np.array([0.8, 0.6, 145.0, 141.0])):  # the second outside the bounds
+        twin = deploy.ScenarioMPC(cstr, 5, cstr.SCENARIOS["mpc"], stage, zero, goal=[0.65], compile=False)
+        mine = gm.ScenarioMPC(cstr, 5, cstr.SCENARIOS["mpc"], stage, goal=[0.65], robust_horizon=1, compile=False)
+        objective, u = first_solve(mine, x0)
+        expected, v = first_solve(twin, x0)
+        assert objective == pytest.approx(expected, rel=1e-5)
+        np.testing.assert_allclose(u, v, atol=0.01 * (cstr.U_HIGH - cstr.U_LOW).min())
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_soft_equals_hard_where_hard_is_feasible(solver):
+    plant = linear_plant(u_max=3.0, x_max=0.5)
+    cost, _ = quadratic(plant, np.diag([1.0, 0.0]))
+    x0, results = np.array([0.45, 0.4]), {}
+    for price in (np.inf, 100.0, 0.0):
+        mpc = gm.ScenarioMPC(plant, 15, np.ones((1, 1)), cost, goal=[0.0], slack_price=price, solver=solver, compile=False)
+        objective, u = first_solve(mpc, x0)
+        results[price] = objective, np.abs(np.hstack(mpc.prediction()["x"])).max()
+    assert results[np.inf][0] == pytest.approx(results[100.0][0], rel=1e-4) and results[100.0][1] < 0.5 + 1e-4
+    assert results[0.0][1] > 0.51 and results[0.0][0] < results[np.inf][0]  # the bound was in the way
+
+
+def test_slack_is_priced_per_physical_unit_and_squared():
+    x, g = ca.SX.sym("x", 4), ca.SX.sym("g", 1)
+    nothing = ca.Function("nothing", [x, g], [0])
+    mpc = gm.ScenarioMPC(
+        cstr, 1, cstr.SCENARIOS["mpc"], nothing, goal=[0.65], robust_horizon=1, slack_price=3.0, slack_price_l2=0.5, compile=False
+    )
+    objective, _ = first_solve(mpc, np.array([0.8, 0.6, 160.0, 155.0]))
+    states = mpc.prediction()["x"][0]
+    violation = np.maximum(states - cstr.X_HIGH[:, None], 0) + np.maximum(cstr.X_LOW[:, None] - states, 0)
+    assert objective == pytest.approx((3 * violation + 0.5 * violation**2).sum(0).mean(), rel=1e-3) and violation.sum() > 10
+
+
+def test_goal_may_change_over_the_horizon():
+    """A plan that knows of the change equals, stage by stage, what the cost says; a wrong shape is refused."""
+    plant, (cost, _) = linear_plant(), (None, None)
+    x, g = ca.SX.sym("x", 2), ca.SX.sym("g", 1)
+    cost = ca.Function("c", [x, g], [(x[0] - g) ** 2])
+    mpc = gm.ScenarioMPC(plant, 20, np.ones((1, 1)), cost, goal=[0.0], change_weight=[1e-6], compile=False)
+    mpc.set_goal(np.repeat([[0.2, -0.3]], [12, 8], axis=1))
+    objective, _ = first_solve(mpc, np.array([0.2, 0.0]))
+    x, u = mpc.prediction()["x"], np.hstack(mpc.prediction()["u"])[0]
+    stages = sum((state[0, 0] - (0.2 if t < 12 else -0.3)) ** 2 for t, state in enumerate(x))
+    assert objective == pytest.approx(stages + 1e-6 * (np.diff(u, prepend=0.0) ** 2).sum(), rel=1e-6)
+    assert x[5][0, 0] == pytest.approx(0.2, abs=0.02) and x[-1][0, 0] == pytest.approx(-0.3, abs=0.02)
+    for bad in ([0.0, 1.0], np.zeros((1, 7)), [np.nan]):
+        with pytest.raises(ValueError, match="goal"):
+            mpc.set_goal(bad)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="no C compiler")
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_compiled_equals_interpreted(solver, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    options = dict(horizon=8, robust_horizon=0, solver=solver)
+    compiled = pendulum(**options, compile=True)
+    assert compiled.compiled and len(list((tmp_path / "rlmpc").iterdir())) == 1
+    a, b = first_solve(compiled, dp.START), first_solve(pendulum(**options), dp.START)
+    assert a[0] == pytest.approx(b[0], rel=1e-8)
+    np.testing.assert_allclose(a[1], b[1], atol=1e-4)
+    pendulum(**options, compile=True)
+    assert len(list((tmp_path / "rlmpc").iterdir())) == 1  # from the cache
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert not pendulum(**options, compile=True).compiled
+
+
+@pytest.mark.parametrize("options", [dict(robust_horizon=1), dict(solver="fatrop", change_weight=[0.1], discretization="radau")])
+def test_shifting_moves_time_and_not_channels(options):
+    controller = pendulum(4, scenarios=dp.SCENARIOS["mpc"][:2], **options)
+    for vector, names in (("w", ("x", "u", "u_before", "inside", "slack")), ("g", ("dynamics", "carried", "collocation", "box"))):
+        values = np.zeros(controller.size[vector])
+        stages = {(name, t): at for name in names for t, at in controller.index.get(name, {}).items()}
+        for (_, t), at in stages.items():
+            values[at] = 1000 * t + 10 * np.arange(at.shape[0])[:, None] + np.arange(at.shape[1])
+        shifted = values[controller.shift[vector]]
+        for (name, t), at in stages.items():
+            later = t + 1 if (name, t + 1) in stages else t
+            np.testing.assert_array_equal(shifted[at], 1000 * later + 10 * np.arange(at.shape[0])[:, None] + np.arange(at.shape[1]))
+
+
+# Failures
+
+
+def test_failure_ladder():
+    """Each rung in turn, by solves that fail on command; a failed iterate is neither applied nor a later start."""
+    controller = pendulum(3, robust_horizon=0)
+    solve, outcomes, guesses = controller._solve, [], []
+
+    def scripted(which, x0, guess, *multipliers):
+        guesses.append(guess)
+        return solve(which, x0, guess, *multipliers) if outcomes.pop(0) else None
+
+    controller._solve = scripted
+
+    def step(*given):
+        outcomes[:] = given
+        u = controller.make_step(dp.START)
+        assert not outcomes and ((dp.U_LOW <= u) & (u <= dp.U_HIGH)).all()
+        return u, controller.stats["rung"], controller.stats["success"]
+
+    u, *rest = step(False, False)  # nothing planned yet: the last action
+    assert rest == ["hold", False] and u == 0
+    assert not np.array_equal(*guesses[-2:])  # the retry starts elsewhere
+    assert step(False, True)[1:] == ("retry", False)
+    assert step(True)[1:] == ("solved", True)
+    planned = controller.prediction()["u"]
+    for t in (1, 2):
+        u, *rest = step(False, False)
+        assert rest == ["plan", False]
+        np.testing.assert_allclose(u, planned[t][:, 0], atol=1e-12)
+    last = u
+    u, *rest = step(False, False)  # the plan is used up
+    assert rest == ["hold", False]
+    np.testing.assert_array_equal(u, last)
+    assert step(True)[1:] == ("solved", True)  # and it recovers
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_every_status_is_read(solver):
+    """A solver stopped after two iterations is a failure, whatever it returned."""
+    controller = pendulum(10, robust_horizon=0, solver=solver)
+    structure = {"structure_detection": "auto", "equality": (controller.bounds["ubg"] == 0).tolist()} if solver == "fatrop" else {}
+    options = {solver: {"print_level": 0, "max_iter": 2}, "print_time": False} | structure
+    controller.solvers = {name: ca.nlpsol(name, solver, controller.nlp, options) for name in ("cold", "warm")}
+    u = controller.make_step(dp.START)
+    assert not controller.stats["success"] and controller.stats["rung"] == "hold" and u == 0
+    with pytest.raises(ValueError, match="no prediction"):
+        controller.prediction()
+
+
+@pytest.mark.parametrize("state", [[0, 3, np.nan, 0, 0, 0], [0, 3, 3, 0, 0], [[0, 3, 3, 0, 0, 0]], [np.inf, 3, 3, 0, 0, 0]])
+def test_a_state_that_is_none_is_refused(state):
+    with pytest.raises(ValueError, match="state"):
+        pendulum(2).make_step(state)
+
+
+def test_problems_that_cannot_be_built_are_refused():
+    with pytest.raises(ValueError, match="horizon is 0"):
+        pendulum(0)
+    with pytest.raises(ValueError, match="fatrop"):
+        pendulum(3, robust_horizon=1, solver="fatrop")
+
+
+# Goals, measures, command line
+
+
+def test_goal_schedules():
+    goals = gm.goal_schedule(dp, ("up-down", "1.5,-0.5@3", "up-up@5"), 6)
+    np.testing.assert_allclose(goals, [[0, np.pi]] * 3 + [[1.5, -0.5]] * 2 + [[0, 0]])
+    np.testing.assert_allclose(gm.goal_schedule(cstr, ("0.7",), 2), [[0.7], [0.7]])
+    np.testing.assert_allclose(gm.goal_schedule(cstr, (), 1), [cstr.EVAL_GOAL])
+    for bad in (
+        ("sideways",),
+        ("1",),
+        ("1,2,3",),
+        ("up-up", "up-down"),
+        ("up-up", "up-down@4", "up-up@4"),
+        ("9,0",),
+        ("up-up", "up-down@x"),
+    ):
+        with pytest.raises(ValueError, match="--goal"):
+            gm.goal_schedule(dp, bad, 6)
+
+
+def test_objectives_are_those_of_the_paper():
+    x, goal = np.array([0.2, 0.4, 2.0, 0.3, -1.0, 2.0]), np.array([0.0, np.pi])
+    squared = (1 - np.cos(0.4)) ** 2 + (1 - np.cos(2.0 - np.pi)) ** 2
+    assert float(gm.stage_cost(dp, "quadratic")(x, goal)) == pytest.approx(squared / 2)
+    assert float(gm.stage_cost(dp, "goal")(x, goal)) == pytest.approx(-np.exp(-squared / 2))
+    assert float(gm.stage_cost(dp, "goal", 0.5)(x, goal)) == pytest.approx(-np.exp(-squared))
+    assert float(gm.stage_cost(dp, "expert")(x, goal)) == pytest.approx(float(dp.kinetic_energy(x) - dp.potential_energy(x)))
+
+
+def test_closed_loop_measures_are_those_of_a_naive_loop():
+    args = gm.Args(horizon=8, compile=False, steps=6)
+    goals = gm.goal_schedule(dp, ("up-down", "up-up@3"), 6)
+    x0, psi = gm.start_and_plant(dp, seed=3, random_plant=True)
+    x, u, predicted, log = gm.simulate(gm.build_controller(args), x0, psi, goals)
+    near, variation, before = 0.0, 0.0, 0.0
+    for t in range(6):
+        np.testing.assert_allclose(x[t + 1], dp.step(x[t], u[t], psi))
+        near += np.exp(-sum((1 - np.cos(x[t + 1][1 + j] - goals[t][j])) ** 2 for j in range(2)) / 0.02)
+        variation, before = variation + abs(u[t][0] - before), u[t][0]
+    row = gm.summary(dp, x, u, goals, log)
+    assert row["time_near_goal"] == pytest.approx(near, abs=1e-5) and row["action_total_variation"] == pytest.approx(variation, abs=1e-5)
+    assert predicted.shape == (6, 9, 6)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="no C compiler")
+def test_swing_up():
+    """Expert and goal-conditioned agent bring both rods up and hold them; 40 of 100 steps is what a good swing-up gives."""
+    for args in (gm.Args(objective="expert"), gm.Args(objective="goal")):
+        mpc = gm.build_controller(args)
+        x, u, _, log = gm.simulate(mpc, dp.START, dp.PSI_NOMINAL, gm.goal_schedule(dp, (), 100))
+        row = gm.summary(dp, x, u, np.zeros((100, 2)), log)
+        assert row["time_near_goal"] > 30 and np.abs(np.sin(x[-5:, 1:3] / 2)).max() < 0.1
+
+
+COLUMNS = (
+    "env objective horizon seed time_near_goal action_total_variation solve_ms_median solve_ms_p95 solve_ms_max solver_failures".split()
+)
+
+
+def run_script(*arguments):
+    return subprocess.run([sys.executable, "goal_mpc.py", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.parametrize(
+    "extra, files",
+    [
+        (["--env", "double_pendulum", "--episodes", "2", "--animate"], {"results.csv", "trajectories.npz", "episode.png", "episode.gif"}),
+        (["--env", "cstr", "--robust-horizon", "1", "--constraints", "hard", "--objective", "quadratic"],
+         {"results.csv", "trajectories.npz", "episode.png"}),
+    ],
+)  # fmt: skip
+def test_command_line_end_to_end(extra, files, tmp_path):
+    out = run_script("--horizon", 6, "--steps", 4, "--no-compile", "--out", tmp_path / "o", *extra)
+    assert out.returncode == 0, out.stderr
+    assert {path.name for path in (tmp_path / "o").iterdir()} == files
+    rows = list(csv.DictReader(open(tmp_path / "o" / "results.csv")))
+    assert list(rows[0]) == COLUMNS and [row["seed"] for row in rows] == ["0", "1"][: len(rows)]
+    assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[2:])
+    assert all(word in out.stdout for word in ("near goal", "action TV", "ms median", "p95", "max", "failed"))
+    again = run_script("--horizon", 6, "--steps", 4, "--no-compile", "--out", tmp_path / "p", *extra)
+    assert again.returncode == 0
+    for mine, other in zip(rows, csv.DictReader(open(tmp_path / "p" / "results.csv")), strict=True):
+        assert all(mine[column] == other[column] for column in COLUMNS if "_ms_" not in column)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--env", "pendulum"], ["--env", "pendulum", "double_pendulum"]),
+        (["--goal", "sideways"], ["--goal", "sideways", "up-down"]),
+        (["--goal", "1,2,3"], ["--goal", "1,2,3", "2 number(s)"]),
+        (["--goal", "up-up", "up-down"], ["--goal", "up-down", "@STEP"]),
+        (["--goal", "nan,0"], ["--goal", "nan,0"]),
+        (["--horizon", "0"], ["--horizon", "0", "[1, "]),
+        (["--objective", "expert", "--env", "cstr"], ["--objective", "expert", "quadratic"]),
+        (["--objective", "best"], ["objective", "best"]),
+        (["--steps", "0"], ["--steps", "0"]),
+        (["--sigma2", "-1"], ["--sigma2", "-1"]),
+        (["--solver", "fatrop", "--robust-horizon", "1"], ["--solver", "fatrop", "robust-horizon"]),
+        (["--scenarios", "all"], ["--scenarios", "all", "extremes"]),
+        (["--change-weight", "1", "2"], ["--change-weight", "1 number(s)"]),
+        (["--animate", "--env", "cstr"], ["--animate", "cstr"]),
+        (["--out", "LICENSE/folder"], ["--out", "cannot write"]),
+        (["--robust-horizon", "5"], ["--robust-horizon", "5", "leaves"]),
+    ],
+)
+def test_bad_arguments_get_one_sentence_and_exit_code_2(arguments, words):
+    out = run_script(*arguments)
+    assert out.returncode == 2 and "Traceback" not in out.stderr
+    assert all(word in out.stderr for word in words), out.stderr
+
+
+def test_help_documents_every_argument():
+    out = run_script("--help")
+    assert out.returncode == 0
+    assert all("--" + field.name.replace("_", "-") in out.stdout for field in fields(gm.Args))
+
+
+def test_default_arguments_are_accepted():
+    plant, goals = gm.check(replace(gm.Args(), steps=5))
+    assert plant is dp and goals.shape == (5, 2)
