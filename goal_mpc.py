@@ -29,7 +29,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -86,6 +86,8 @@ class Args:
 
     solver: Literal["ipopt", "fatrop"] = "ipopt"
     """fatrop: faster on long horizons, fails more often; nominal problems (--robust-horizon 0) only"""
+    guide_horizon: int = 0
+    """horizon of a controller whose simulated closed loop is the first guess; 0: the start state held. Helps from N = 100 on"""
     compile: bool = True
     """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc)"""
     animate: bool = False
@@ -137,10 +139,12 @@ class ScenarioMPC:
     unit; an infinite slack_price makes a bound hard, 0 ignores it.
     change_weight: (n_u,), price of the squared change of each action.
     solver: "ipopt", or "fatrop" for robust_horizon = 0.
+    guide: another controller for the same plant, of a shorter horizon: its simulated closed loop is the first guess, or None.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=0, discretization="rk4",
-                 slack_price=1.0, slack_price_l2=0.0, change_weight=None, solver="ipopt", tol=1e-6, compile=True):  # fmt: skip
+                 slack_price=1.0, slack_price_l2=0.0, change_weight=None, solver="ipopt", guide=None, tol=1e-6,
+                 compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         if solver == "fatrop" and robust_horizon:
@@ -156,7 +160,7 @@ class ScenarioMPC:
         self.slack_price_l2 = np.broadcast_to(slack_price_l2, bounds.shape)
         self.hard_bounds = np.where(np.isinf(self.slack_price), bounds, [[-np.inf], [np.inf]])
         self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight, dtype=float)
-        self.solver = solver
+        self.solver, self.guide = solver, guide
         self.lifted = solver == "fatrop" and self.change_weight.any()  # fatrop's stages must not reach back: carry u_{t-1} as a state
         self._build_tree()
         self._build_layout()
@@ -297,7 +301,7 @@ class ScenarioMPC:
     def _build_solvers(self, compile, tol):
         """The solver twice on the same functions: from scratch, and (IPOPT) from a nearby solution with its multipliers."""
         cold = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 500, "bound_relax_factor": 0.0}
-        warm = cold | {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
+        warm = cold | {"warm_start_init_point": "yes", "mu_init": 1e-7, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                        "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
 
         def options(name):
@@ -335,7 +339,7 @@ class ScenarioMPC:
         self.goal = np.broadcast_to(goal.reshape(self.n_goal, -1), (self.n_goal, self.horizon))
 
     def set_initial_guess(self, x0):
-        """Forget the previous plan: the next solve starts from `hold_guess`."""
+        """Forget the previous plan: the next solve starts from `guided_guess` if there is a guide, else from `hold_guess`."""
         envs.checked_state(self.plant, x0)
         self.plan, self.plan_left = None, 0
 
@@ -348,14 +352,32 @@ class ScenarioMPC:
             w[self.positions("inside")] = np.tile(scaled, RADAU_DEGREE)[:, None]
         return w
 
-    def drift_guess(self, x0):
-        """w with the last action held, and the nominal motion under it."""
+    def rollout_guess(self, x0, action):
+        """w with the actions `action(t, x)` and the motion of the nominal plant under them, the same under every scenario."""
         w, x = self.hold_guess(x0), np.asarray(x0)
-        w[self.positions("u")] = ((self.u_before - self.u_center) / self.u_scale)[:, None]
-        for t in range(1, self.horizon + 1):
-            x = self.plant.step(x, self.u_before, self.scenarios[0])
-            w[self.index["x"][t]] = ((x - self.x_center) / self.x_scale)[:, None]
+        for t in range(self.horizon):
+            u = action(t, x)
+            x = self.plant.step(x, u, self.scenarios[0])
+            scaled = (x - self.x_center) / self.x_scale
+            w[self.index["u"][t]] = ((u - self.u_center) / self.u_scale)[:, None]
+            w[self.index["x"][t + 1]] = scaled[:, None]
+            if self.discretization == "radau":
+                w[self.index["inside"][t]] = np.tile(scaled, RADAU_DEGREE)[:, None]
         return w
+
+    def drift_guess(self, x0):
+        """w with the last action held."""
+        return self.rollout_guess(x0, lambda t, x: self.u_before)
+
+    def guided_guess(self, x0):
+        """w with the closed loop of the guide: a long problem left to itself often ends in a plan that puts its task off."""
+
+        def action(t, x):
+            self.guide.set_goal(self.goal[:, t])
+            return self.guide.make_step(x)
+
+        self.guide.reset()
+        return self.rollout_guess(x0, action)
 
     def physical(self, w, name, t):
         """States ("x") or actions ("u") of stage t in w, physical units, (rows, nodes)."""
@@ -379,13 +401,14 @@ class ScenarioMPC:
     def make_step(self, x0):
         """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
 
-        Ladder: a solve from the shifted previous plan, or at first from `hold_guess`; if it does not succeed, one more from a cold guess
+        Ladder: a solve from the shifted previous plan, or at first from a cold guess; if it does not succeed, one more from a guess
         that was not tried yet; then the next action of the last successful plan, while it lasts; then the last action. `stats` says which.
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
         if self.plan is None:
-            solution, other = self._solve("cold", x0, self.hold_guess(x0)), self.drift_guess
+            first, other = (self.guided_guess, self.hold_guess) if self.guide is not None else (self.hold_guess, self.drift_guess)
+            solution = self._solve("cold", x0, first(x0))
         else:
             solution, other = self._solve("warm", x0, *self.plan), self.hold_guess
         if solution is None:
@@ -452,6 +475,7 @@ def stage_cost(plant, objective, sigma2=None):
 def build_controller(args):
     """The controller that the arguments describe, for the plant's evaluation goal."""
     plant = envs.load(args.env)
+    guide = build_controller(replace(args, horizon=args.guide_horizon, guide_horizon=0)) if args.guide_horizon else None
     change_weight = args.change_weight
     if change_weight is None and args.objective == "expert":
         change_weight = getattr(plant, "EXPERT_CHANGE_WEIGHT", None)
@@ -459,7 +483,7 @@ def build_controller(args):
     return ScenarioMPC(plant, args.horizon, plant.SCENARIOS[args.scenarios], stage_cost(plant, args.objective, args.sigma2),
                        goal=plant.EVAL_GOAL, robust_horizon=args.robust_horizon, discretization=args.discretization,
                        slack_price=np.inf if hard else args.slack_weight, slack_price_l2=args.slack_weight_l2,
-                       change_weight=change_weight, solver=args.solver, compile=args.compile)  # fmt: skip
+                       change_weight=change_weight, solver=args.solver, guide=guide, compile=args.compile)  # fmt: skip
 
 
 # Closed loop
@@ -608,7 +632,7 @@ def fail(message):
 def check(args):
     """Refuse arguments that cannot work, before anything long starts; returns plant and goals (steps, n_goal)."""
     ranges = {"horizon": (1, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "seed": (0, 10**9),
-              "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6), "slack_weight_l2": (0, 1e6)}  # fmt: skip
+              "guide_horizon": (0, 1000), "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6), "slack_weight_l2": (0, 1e6)}  # fmt: skip
     for name, (least, most) in ranges.items():
         value = getattr(args, name)
         if value is not None and not least <= value <= most:  # catches nan too
