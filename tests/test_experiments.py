@@ -15,8 +15,12 @@ EXPERIMENTS = {
     "cstr_training": ["cstr_training.csv", "cstr_training_seeds.csv"],
     "cstr_deploy": ["cstr_deploy.csv"],
     "cstr_profile": ["cstr_profile.csv"],
+    "dip_performance": ["dip_performance.csv"],
+    "dip_equilibria": ["dip_equilibria.csv", "dip_profile.csv"],
 }
-TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi"}
+FIGURES = {name: name for name in EXPERIMENTS} | {"dip_equilibria": "dip_profile"}
+NO_RUNS = {"cstr_profile", "dip_equilibria"}  # too short to be kept in parts
+TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium"}
 
 
 def run(name, *arguments):
@@ -27,9 +31,9 @@ def run(name, *arguments):
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick_run(name, tmp_path):
-    keep = ["--runs", tmp_path / "runs"] if name != "cstr_profile" else []
+    keep = ["--runs", tmp_path / "runs"] if name not in NO_RUNS else []
     run(name, "--quick", "--out", tmp_path, *keep)
-    assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
+    assert (tmp_path / "figures" / f"{FIGURES[name]}.png").stat().st_size > 10_000
     for table in EXPERIMENTS[name]:
         rows = list(csv.DictReader(open(tmp_path / "results" / table)))
         committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
@@ -43,7 +47,13 @@ def test_quick_run(name, tmp_path):
 def test_figures_are_drawn_from_the_committed_tables(name, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
     run(name, "--plot-only", "--out", tmp_path)
-    assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
+    assert (tmp_path / "figures" / f"{FIGURES[name]}.png").stat().st_size > 10_000
+
+
+def test_study_of_the_values(tmp_path):
+    shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
+    run("cstr_deploy", "--study", "value", "--plot-only", "--out", tmp_path)
+    assert (tmp_path / "figures/cstr_value.png").stat().st_size > 10_000
 
 
 def test_shipped_critics_are_the_first_seed_of_the_committed_table():

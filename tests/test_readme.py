@@ -18,10 +18,10 @@ def test_python_snippets_run():
 
 
 def test_files_arguments_and_figures_that_it_names_exist():
-    for path in re.findall(r"\]\(([^)]+)\)", README) + re.findall(r"`([\w/]+\.(?:py|pt|txt|csv|png))`", README):
+    for path in re.findall(r"\]\(([^)]+)\)", README) + re.findall(r"`([\w/]+\.(?:py|pt|txt|csv|png|gif))`", README):
         if "NAME" not in path and ("/" in path or path.endswith(".py")):
             assert (ROOT / path).exists() or (ROOT / "envs" / path).exists(), path
-    scripts = {name: (ROOT / name).read_text() for name in ("sac_her_branching.py", "rl_mpc_deploy.py")}
+    scripts = {name: (ROOT / name).read_text() for name in ("sac_her_branching.py", "goal_mpc.py", "rl_mpc_deploy.py")}
     for script, arguments in re.findall(r"python (\w+\.py)((?: +[^\s`#]+)*)", README):
         for argument in re.findall(r"--([\w-]+)", arguments):
             assert f"    {argument.replace('-', '_')}: " in scripts[script], (script, argument)
