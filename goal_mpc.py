@@ -530,7 +530,7 @@ def start_and_plant(plant, seed, random_plant):
     return x0, rng.choice(plant.EVAL_PSI) if random_plant else plant.PSI_NOMINAL
 
 
-# Table, figure, animation
+# Table and figure
 
 
 def table(rows):
@@ -577,49 +577,11 @@ def figure(plant, x, u, goals, path):
             ax.set_yticks([0, np.pi], ["0 (up)", "π (down)"])
             ax.set_ylim(-np.pi / 2 - 0.1, 3 * np.pi / 2 + 0.1)
         ax.set_title(titles[i], fontsize=10, loc="left")
+    axes[-1, 0].set_xlim(0, time_axis[-1])
     axes[-1, 0].set_xlabel(f"time [{plant.TIME_UNIT}]")
     handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
     fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
     fig.savefig(path, dpi=150)
-    plt.close(fig)
-
-
-def animate(plant, x, u, predicted, goals, path, every=2):
-    """GIF of the motion in real time, a frame per `every` steps; the predicted motion is drawn faintly, the goal dotted."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
-    fig, ax = plt.subplots(figsize=(6, 3.9), layout="constrained")
-    (ghosts,) = ax.plot([], [], color="#56B4E9", lw=1, alpha=0.6)
-    (target,) = ax.plot([], [], ":", color="#CC79A7", lw=3)
-    (rods,) = ax.plot([], [], "-o", color="#0072B2", lw=4, ms=6)
-    (cart,) = ax.plot([], [], "s", color="black", ms=16)
-    (force,) = ax.plot([], [], color="#D55E00", lw=5)
-    clock = ax.text(0.02, 0.93, "", transform=ax.transAxes)
-    ax.legend([rods, ghosts, target, force], ["rods", "prediction", "goal", "force"], loc="upper right", ncols=4, fontsize=8, frameon=False)
-    ax.set(ylim=(-1.2, 1.5), aspect="equal", xlabel="position [m]", yticks=[])
-    ax.axhline(0, color="grey", lw=1, zorder=0)
-    view = np.convolve(np.pad(plant.skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid")  # the camera follows the cart
-
-    def draw(t):
-        points = plant.skeleton(x[t])
-        step = max(predicted.shape[1] // 12, 1)
-        faint = plant.skeleton(predicted[t, ::step])
-        ghosts.set_data(*np.concatenate([np.vstack([p, [[np.nan, np.nan]]]) for p in faint]).T)
-        aim = x[t].copy()
-        aim[plant.GOAL_INDEX] = goals[t]
-        target.set_data(*plant.skeleton(aim).T)
-        rods.set_data(*points.T)
-        cart.set_data(points[:1, 0], points[:1, 1])
-        force.set_data([points[0, 0], points[0, 0] + 0.15 * u[t, 0]], [-0.2, -0.2])
-        ax.set_xlim(view[t] - 2.2, view[t] + 2.2)
-        clock.set_text(f"t = {t * plant.DT:4.1f} {plant.TIME_UNIT}")
-
-    frames = range(0, len(u), every)
-    FuncAnimation(fig, draw, frames=frames).save(path, writer=PillowWriter(fps=round(1 / (every * plant.DT), 2)), dpi=80)
     plt.close(fig)
 
 
@@ -653,8 +615,8 @@ def check(args):
     weights = args.change_weight
     if weights is not None and not (len(weights) == len(plant.U_LOW) and all(0 <= weight < np.inf for weight in weights)):
         fail(f"--change-weight is {weights}; it needs {len(plant.U_LOW)} number(s), each at least 0")
-    if args.animate and not hasattr(plant, "skeleton"):
-        fail(f"--animate needs a plant that can be drawn; {args.env} defines no skeleton")
+    if args.animate and not hasattr(plant, "animate"):
+        fail(f"--animate needs a plant that can be drawn; {args.env} defines no animation")
     return plant, goals
 
 
@@ -685,7 +647,7 @@ def main(args):
     np.savez_compressed(out / "trajectories.npz", goals=goals, **{k: np.stack([e[i] for e in episodes]) for i, k in enumerate("xu")})
     figure(plant, *episodes[0][:2], goals, out / "episode.png")
     if args.animate:
-        animate(plant, *episodes[0], goals, out / "episode.gif")
+        plant.animate(*episodes[0], goals, out / "episode.gif")
     print(table(rows))
     print(", ".join(str(path) for path in sorted(out.iterdir())))
     return rows

@@ -19,7 +19,7 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     REWARD_SIGMA2, REWARD_TOLERANCE, MPC_SIGMA2   width of the Gaussian reward, half-width of the sparse one, width in goal_mpc.py
     ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
     MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
-optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), skeleton(x) (points to draw)
+optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), animate(...)
 
 `GoalEnv` and `VectorGoalEnv` below turn such a module into environments; importing `envs` registers one id per module.
 """

@@ -2,7 +2,7 @@
 serves RL+MPC best.
 
     python experiments/cstr_deploy.py --jobs 2      # 50 draws, half an hour; continues, variant by variant, where it stopped
-    python experiments/cstr_deploy.py --study value --episodes 24
+    python experiments/cstr_deploy.py --study value --episodes 10
     python experiments/cstr_deploy.py --plot-only   # redraw from the committed CSV
 
 Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png; the second

@@ -67,7 +67,7 @@ def collect(args):
             values = np.hstack([x, np.vstack([u, u[-1:]]), np.vstack([goals[:1], goals])])
             write([{"step": t} | dict(zip(names, row)) for t, row in enumerate(values.tolist())], args.out / "results/dip_profile.csv")
             (args.out / "figures").mkdir(exist_ok=True)
-            gm.animate(plant, x, u, predicted, goals, args.out / "figures/dip_profile.gif")
+            plant.animate(x, u, predicted, goals, args.out / "figures/dip_profile.gif")
     write(rows, args.out / "results/dip_equilibria.csv")
 
 

@@ -9,6 +9,8 @@ from gymnasium.utils.env_checker import check_env
 from scipy.integrate import solve_ivp
 
 import envs
+import rl_mpc_deploy as deploy
+import sac_her_branching as training
 from envs import double_pendulum as dp
 
 
@@ -111,3 +113,26 @@ def test_vector_env_follows_the_physics_and_errors_go_the_short_way_round():
     for _ in range(150):
         new = vec.step(np.full((4, 1), 5.0))[0]
         assert vec.observation_space.contains(new)
+
+
+def test_training_and_deployment_run_on_it(tmp_path):
+    """A few hundred transitions; the checkpoint's networks see angles as sine and cosine, in torch and in CasADi alike."""
+    run = training.main(
+        training.Args(env="double_pendulum", total_timesteps=2_000, num_envs=8, batch_size=32, eval_episodes=10, out=tmp_path)
+    )
+    policy = training.load_policy(run / "checkpoint.pt")
+    x, turns = dp.START[None], np.array([[0, 2 * np.pi, -4 * np.pi, 0, 0, 0]])
+    np.testing.assert_allclose(policy.act(x + turns, dp.EVAL_GOAL), policy.act(x, dp.EVAL_GOAL), atol=1e-4)  # a full turn is none
+    for goal_input in ("error", "goal"):
+        data = torch.load(run / "checkpoint.pt", weights_only=True) | {"goal_input": goal_input}
+        torch.save(data, tmp_path / "c.pt")
+        critic = deploy.load_critic(tmp_path / "c.pt", "double_pendulum")
+        mu, _, V = deploy.export(critic)
+        assert deploy.check_export(critic, V, dp) < 1e-12
+        policy = training.load_policy(tmp_path / "c.pt")
+        np.testing.assert_allclose(np.array(mu(dp.START, [0.1, 3.0])).ravel(), policy.act(x, [0.1, 3.0])[0], atol=1e-3)
+    args = deploy.Args(env="double_pendulum", critic=run / "checkpoint.pt", horizon=2, episodes=1, steps=3, jobs=1, compile=False,
+                       controllers=("actor", "nominal_mpc", "rl_mpc"), goal=(0.0, 3.0), out=tmp_path / "deploy")  # fmt: skip
+    rows = deploy.main(args)
+    assert [row["controller"] for row in rows] == ["actor", "nominal_mpc", "rl_mpc"]
+    assert all(np.isfinite(row["time_near_goal"]) and row["time_outside_constraints"] == 0 for row in rows)
