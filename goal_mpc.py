@@ -4,9 +4,9 @@
 # ///
 """Goal-conditioned scenario MPC written out in CasADi: scenario tree, soft constraints, Gaussian objective (eq:multiMPCobj).
 
-    minimise over u   1/S sum_i { sum_{t=1}^{N} [ l(x_t^i, g_t) + w'eps_t^i + w2'(eps_t^i)^2 + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
-    subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi^i),   x_0^i = s,   x_t^i - eps_t^i in X,   u_t^i in U,   u_t^i = u_t^j while i and j
-                      share their history: to the end of the robust horizon, where the tree stops branching
+    minimise over u   1/S sum_i { sum_{t=1}^{N} [ l(x_t^i, g_t) + w'|eps_t^i| + w2'(eps_t^i)^2 + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
+    subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi_t^i),   x_0^i = s,   x_t^i - eps_t^i in X,   u_t^i in U,   u_t^i = u_t^j while i and j
+                      share their history; over the robust horizon the paths i take every sequence of scenarios, then each keeps its last
 
 with the stage cost l chosen by `--objective` (the paper's Example 1) from the plant's goal error e, for the pendulum 1 - cos(theta - g):
 goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy.
@@ -24,6 +24,7 @@ import csv
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -54,7 +55,7 @@ class Args:
     horizon: int = 75
     """prediction steps N"""
     sigma2: float | None = None
-    """sigma^2 of the Gaussian objective, squared units of the goal error; default: the plant's (double_pendulum: 1, cstr: 0.01)"""
+    """sigma^2 of the Gaussian of --objective goal, squared units of the goal error; default: the plant's (1 or 0.01)"""
     goal: tuple[str, ...] = ()
     """a name (double_pendulum: up-up, up-down, down-up) or numbers joined by commas; @STEP after it: from that step on.
     Default: the plant's evaluation goal"""
@@ -72,13 +73,13 @@ class Args:
     robust_horizon: int = 0
     """stages at which the scenario tree branches; 0: the nominal model alone"""
     scenarios: str = "mpc"
-    """name of the plant's scenario set that the tree branches over"""
+    """name of the plant's scenario set that the tree branches over; the nominal plant comes first, added if the set lacks it"""
     discretization: Literal["rk4", "radau"] = "rk4"
     """prediction model: explicit Runge-Kutta steps, or Radau collocation of degree 3"""
     constraints: Literal["soft", "hard"] = "soft"
     """whether the state bounds may be violated at a price"""
     slack_weight: float = 10.0
-    """L1 price of a violation, per physical unit and step"""
+    """L1 price of a violation, per physical unit and step (10: a metre off the track costs what ten steps at the goal earn)"""
     slack_weight_l2: float = 0.0
     """price of its square"""
     change_weight: tuple[float, ...] | None = None
@@ -91,7 +92,7 @@ class Args:
     compile: bool = True
     """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc)"""
     animate: bool = False
-    """write episode.gif, with the predicted motion drawn faintly"""
+    """write episode.gif of the first episode, with the predicted motion drawn faintly"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__goal_mpc__{seed}__{time}"""
 
@@ -112,7 +113,8 @@ def compiled_solver(plugin, nlp, options):
             raise OSError("no gcc, clang or cc")
         version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
         cpu = Path("/proc/cpuinfo")
-        processor = cpu.read_text().split("\n\n")[0].split("flags")[-1] if cpu.exists() else platform.processor()
+        flags = re.search(r"^(flags|Features)\s*:.*", cpu.read_text(), re.MULTILINE) if cpu.exists() else None
+        processor = flags[0] if flags else platform.processor()
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
             ca.nlpsol("nlp", plugin, nlp, options("cold")).generate_dependencies("nlp.c")
@@ -170,7 +172,7 @@ class ScenarioMPC:
         self.reset()
 
     def _build_tree(self):
-        """nodes[t]: how many; over all nodes but the root: parent (a column among all nodes), stage, psi and weight."""
+        """nodes[t]: how many. Over all nodes, stage by stage: stage, weight; over all but the root: parent (among all nodes), psi."""
         S, R = len(self.scenarios), self.robust_horizon
         self.nodes = [S ** min(t, R) for t in range(self.horizon + 1)]
         first = np.concatenate([[0], np.cumsum(self.nodes)])
@@ -377,6 +379,7 @@ class ScenarioMPC:
             return self.guide.make_step(x)
 
         self.guide.reset()
+        self.guide.u_before = self.u_before
         return self.rollout_guess(x0, action)
 
     def physical(self, w, name, t):
@@ -440,22 +443,25 @@ class ScenarioMPC:
 
 def goal_schedule(plant, texts, steps):
     """The goal at each of x_1 ... x_steps, (steps, n_goal), from texts such as ("up-up", "0,3.14@100"). Raises ValueError, one sentence."""
-    named, first, goal = getattr(plant, "GOALS", {}), 0, np.empty((steps, len(plant.GOAL_INDEX)))
-    for position, text in enumerate(texts or [",".join(map(str, plant.EVAL_GOAL))]):
+    named, first, goals = getattr(plant, "GOALS", {}), -1, np.empty((steps, len(plant.GOAL_INDEX)))
+    for text in texts or [",".join(map(str, plant.EVAL_GOAL))]:
         value, _, when = text.partition("@")
         try:
-            start = int(when) if when or position else 0
-            target = np.array(named[value] if value in named else [float(number) for number in value.split(",")])
+            goal = np.array(named[value] if value in named else [float(number) for number in value.split(",")])
+            start = int(when) if when else -1
         except ValueError:
-            start, target = -1, np.empty(0)
-        if start < first + (position > 0) or target.shape != plant.EVAL_GOAL.shape:
-            names = f"one of {', '.join(named)}, or " if named else ""
-            numbers = f"{len(plant.EVAL_GOAL)} number(s) joined by commas, all but the first followed by @STEP in increasing order"
-            raise ValueError(f"--goal {text} is not a goal of {plant.ENV_ID}; it must be {names}{numbers}")
-        if not ((plant.GOAL_LOW <= target) & (target <= plant.GOAL_HIGH)).all():
+            goal, start = np.empty(0), -1
+        if goal.shape != plant.EVAL_GOAL.shape:
+            allowed = ", ".join(named) + " or " * bool(named) + f"{len(plant.EVAL_GOAL)} number(s) joined by commas"
+            raise ValueError(f"--goal {text} is not a goal of {plant.ENV_ID}; it must be {allowed}")
+        if not ((plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
             raise ValueError(f"--goal {text} is out of range; it must lie in {plant.GOAL_LOW} to {plant.GOAL_HIGH}")
-        goal[start:], first = target, start
-    return goal
+        if first < 0 and not when:
+            start = 0
+        if not (first < start < steps and (first >= 0 or start == 0)):
+            raise ValueError(f"--goal {text} needs @STEP, increasing from goal to goal and below {steps}; the first goal starts at 0")
+        goals[start:], first = goal, start
+    return goals
 
 
 def stage_cost(plant, objective, sigma2=None):
@@ -476,13 +482,13 @@ def build_controller(args):
     """The controller that the arguments describe, for the plant's evaluation goal."""
     plant = envs.load(args.env)
     guide = build_controller(replace(args, horizon=args.guide_horizon, guide_horizon=0)) if args.guide_horizon else None
-    change_weight = args.change_weight
-    if change_weight is None and args.objective == "expert":
-        change_weight = getattr(plant, "EXPERT_CHANGE_WEIGHT", None)
-    hard = args.constraints == "hard"
-    return ScenarioMPC(plant, args.horizon, plant.SCENARIOS[args.scenarios], stage_cost(plant, args.objective, args.sigma2),
+    change_weight = plant.EXPERT_CHANGE_WEIGHT if args.change_weight is None and args.objective == "expert" else args.change_weight
+    scenarios = plant.SCENARIOS[args.scenarios]
+    nominal = (scenarios == plant.PSI_NOMINAL).all(axis=1)
+    scenarios = np.concatenate([plant.PSI_NOMINAL[None], scenarios[~nominal]])
+    return ScenarioMPC(plant, args.horizon, scenarios, stage_cost(plant, args.objective, args.sigma2),
                        goal=plant.EVAL_GOAL, robust_horizon=args.robust_horizon, discretization=args.discretization,
-                       slack_price=np.inf if hard else args.slack_weight, slack_price_l2=args.slack_weight_l2,
+                       slack_price=np.inf if args.constraints == "hard" else args.slack_weight, slack_price_l2=args.slack_weight_l2,
                        change_weight=change_weight, solver=args.solver, guide=guide, compile=args.compile)  # fmt: skip
 
 
@@ -511,11 +517,15 @@ def simulate(mpc, x0, psi, goals, preview=False, progress=None):
 
 
 def summary(plant, x, u, goals, log):
-    """The measures of an episode: time near goal over x_1 ..., sum of absolute changes of the actions from 0 on, solve times, failures."""
+    """The measures of an episode: time near goal over x_1 ..., sum of absolute changes of the actions from 0 on, solve times, failures.
+
+    The changes are in the physical unit of a single action; of several, each is counted in units of its range.
+    """
+    unit = 1.0 if len(plant.U_LOW) == 1 else plant.U_HIGH - plant.U_LOW
     milliseconds = np.array([s["wall_ms"] for s in log])
     row = {
         "time_near_goal": envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=METRIC_SIGMA2).sum(),
-        "action_total_variation": np.abs(np.diff(u, axis=0, prepend=0.0)).sum(),
+        "action_total_variation": np.abs(np.diff(u / unit, axis=0, prepend=0.0)).sum(),
         "solve_ms_median": np.median(milliseconds),
         "solve_ms_p95": np.quantile(milliseconds, 0.95),
         "solve_ms_max": milliseconds.max(),
@@ -531,6 +541,16 @@ def start_and_plant(plant, seed, random_plant):
 
 
 # Table and figure
+
+
+def write_csv(rows, path):
+    """Rows of equal keys as a table; a killed process leaves no half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path.with_suffix(".tmp"), "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    path.with_suffix(".tmp").replace(path)
 
 
 def table(rows):
@@ -608,8 +628,15 @@ def check(args):
     if args.scenarios not in plant.SCENARIOS:
         fail(f"--scenarios {args.scenarios} is not a scenario set of {args.env}; choose one of {', '.join(plant.SCENARIOS)}")
     leaves = len(plant.SCENARIOS[args.scenarios]) ** min(args.robust_horizon, args.horizon)
-    if leaves > 1000:
-        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
+    if leaves * args.horizon > 20_000:
+        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; leaves times --horizon may be 20000 at most")
+    if not args.guide_horizon < args.horizon:
+        fail(f"--guide-horizon is {args.guide_horizon}; it must be below --horizon {args.horizon}")
+    if args.objective == "expert" and (goals != plant.EVAL_GOAL).any():
+        fail(f"--objective expert knows the goal {plant.EVAL_GOAL} only; give --goal to --objective goal or quadratic")
+    if (goals < plant.GOAL_REACHABLE[0]).any() or (goals > plant.GOAL_REACHABLE[1]).any():
+        low, high = plant.GOAL_REACHABLE
+        print(f"warning: --goal {' '.join(args.goal)} leaves {low} to {high}, where every scenario can hold it", file=sys.stderr)
     if args.solver == "fatrop" and args.robust_horizon:
         fail(f"--solver fatrop solves nominal problems only; --robust-horizon is {args.robust_horizon}, it must be 0")
     weights = args.change_weight
@@ -640,10 +667,7 @@ def main(args):
                 {"env": args.env, "objective": args.objective, "horizon": args.horizon, "seed": seed} | summary(plant, x, u, goals, log)
             )
             episodes.append((x, u, predicted))
-    with open(out / "results.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(rows, out / "results.csv")
     np.savez_compressed(out / "trajectories.npz", goals=goals, **{k: np.stack([e[i] for e in episodes]) for i, k in enumerate("xu")})
     figure(plant, *episodes[0][:2], goals, out / "episode.png")
     if args.animate:

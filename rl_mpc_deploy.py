@@ -26,6 +26,7 @@ import json
 import multiprocessing
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -235,7 +236,8 @@ def compiled_solver(nlp, options):
             raise OSError("no gcc, clang or cc")
         version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
         cpu = Path("/proc/cpuinfo")
-        processor = cpu.read_text().split("\n\n")[0].split("flags")[-1] if cpu.exists() else platform.processor()
+        flags = re.search(r"^(flags|Features)\s*:.*", cpu.read_text(), re.MULTILINE) if cpu.exists() else None
+        processor = flags[0] if flags else platform.processor()
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
             ca.nlpsol("nlp", "ipopt", nlp).generate_dependencies("nlp.c")

@@ -39,14 +39,6 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def write(rows, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def collect(args):
     hold, episodes = (4, 1) if args.quick else (args.hold, args.episodes)
     settings = gm.Args(objective="goal", sigma2=0.5, horizon=3 if args.quick else 35, compile=not args.quick)
@@ -59,16 +51,18 @@ def collect(args):
             part = slice(i * hold, (i + 1) * hold)
             row = gm.summary(plant, x[i * hold : (i + 1) * hold + 1], u[part], goals[part], log[part])
             near = gm.envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=gm.METRIC_SIGMA2)[part]
-            row.pop("action_total_variation")  # of a part it is not defined
+            row.pop("action_total_variation")  # is that of a whole episode
             reached = int(np.argmax(near > 0.9)) if near.max() > 0.9 else hold
             rows.append({"seed": seed, "equilibrium": name, "steps_to_reach": reached, "near_last_20": round(near[-20:].mean(), 6)} | row)
         if seed == args.seed:
             names = [*plant.STATE_NAMES, *plant.ACTION_NAMES, "goal_1", "goal_2"]
             values = np.hstack([x, np.vstack([u, u[-1:]]), np.vstack([goals[:1], goals])])
-            write([{"step": t} | dict(zip(names, row)) for t, row in enumerate(values.tolist())], args.out / "results/dip_profile.csv")
+            gm.write_csv(
+                [{"step": t} | dict(zip(names, row)) for t, row in enumerate(values.tolist())], args.out / "results/dip_profile.csv"
+            )
             (args.out / "figures").mkdir(exist_ok=True)
             plant.animate(x, u, predicted, goals, args.out / "figures/dip_profile.gif")
-    write(rows, args.out / "results/dip_equilibria.csv")
+    gm.write_csv(rows, args.out / "results/dip_equilibria.csv")
 
 
 def plot(args):

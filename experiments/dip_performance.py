@@ -59,14 +59,6 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-def write(rows, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def run_cell(settings, path):
     """One controller from every start; rows of results.csv with the guide's horizon, into `path`."""
     mpc, goals, rows = gm.build_controller(settings), np.zeros((settings.steps, 2)), []
@@ -75,7 +67,7 @@ def run_cell(settings, path):
         x, u, _, log = gm.simulate(mpc, x0, psi, goals)
         head = {"env": settings.env, "objective": settings.objective, "horizon": settings.horizon, "guide_horizon": settings.guide_horizon}
         rows.append(head | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)} | gm.summary(double_pendulum, x, u, goals, log))
-    write(rows, path)
+    gm.write_csv(rows, path)
 
 
 def collect(args):
@@ -86,19 +78,20 @@ def collect(args):
             settings = gm.Args(objective=objective, horizon=horizon, guide_horizon=guide, episodes=args.episodes, seed=args.seed)
             if args.quick:
                 settings = gm.replace(settings, horizon=horizon // 25, guide_horizon=guide // 25, episodes=2, steps=5, compile=False)
-            inputs = b"".join(Path(module.__file__).read_bytes() for module in (gm, double_pendulum))
+            inputs = b"".join(Path(module.__file__).read_bytes() for module in (gm, gm.envs, double_pendulum))
             paths.append(args.runs / f"{hashlib.sha256(repr(settings).encode() + inputs).hexdigest()[:12]}.csv")
             if not paths[-1].exists():
                 futures.append(pool.submit(run_cell, settings, paths[-1]))
         for future in tqdm(futures, unit="cell", disable=None):
             future.result()
-    write([row for path in paths for row in read(path)], args.out / "results/dip_performance.csv")
+    gm.write_csv([row for path in paths for row in read(path)], args.out / "results/dip_performance.csv")
 
 
 def plot(args):
     rows = read(args.out / "results/dip_performance.csv")
     panels = {"time_near_goal": "time near goal [steps]", "action_total_variation": "action total variation [N]"}
     columns = list(dict.fromkeys((row["horizon"], row["guide_horizon"]) for row in rows))
+    variation = {}  # (objective, column): median
     fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
     print(f"{'objective':10s}{'N':>5s}{'guide':>6s}{'near goal: median [min, max]':>32s}{'action TV: median [min, max]':>32s}"
           f"{'ms median':>11s}{'p95':>8s}{'worst':>9s}{'failed':>8s}")  # fmt: skip
@@ -114,13 +107,15 @@ def plot(args):
                 ax.plot(at + jitter, values, MARKERS[objective], color=colour, ms=4, alpha=0.5)
                 ax.plot([at - 0.1, at + 0.1], [np.median(values)] * 2, color=colour, lw=3, label=objective if not position else None)
                 line += f"{np.median(values):16.1f} [{values.min():5.1f}, {values.max():5.1f}]"
+            variation[objective, position] = np.median(column["action_total_variation"])
             times = (np.median(column["solve_ms_median"]), np.median(column["solve_ms_p95"]), column["solve_ms_max"].max())
             print(f"{line}{times[0]:11.1f}{times[1]:8.1f}{times[2]:9.0f}{column['solver_failures'].sum():8.0f}")
-    labels = [
-        f"N = {horizon}" + (f"\nfirst guess: closed loop, N = {guide}" if guide != "0" else "\nfirst guess: start held")
-        for horizon, guide in columns
-    ]
-    axes[1].set_xticks(range(len(columns)), labels)
+    fall = {objective: 1 - variation[objective, 2] / variation[objective, 0] for objective in ("quadratic", "goal")}
+    print(f"expert's variation in the second column: {variation['expert', 1] / variation['quadratic', 1]:.2f} of the quadratic agent's, "
+          f"{variation['expert', 1] / variation['goal', 1]:.2f} of the goal-conditioned agent's; "
+          f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}")  # fmt: skip
+    guesses = {"0": "start held"} | {guide: f"closed loop, N = {guide}" for _, guide in columns if guide != "0"}
+    axes[1].set_xticks(range(len(columns)), [f"N = {horizon}\nfirst guess: {guesses[guide]}" for horizon, guide in columns])
     for ax, title in zip(axes, panels.values()):
         ax.set_ylabel(title)
         ax.set_ylim(bottom=0)

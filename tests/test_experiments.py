@@ -50,6 +50,10 @@ def test_figures_are_drawn_from_the_committed_tables(name, tmp_path):
     assert (tmp_path / "figures" / f"{FIGURES[name]}.png").stat().st_size > 10_000
 
 
+def test_the_animation_is_small_enough_for_the_readme():
+    assert (ROOT / "experiments/figures/dip_profile.gif").stat().st_size < 2e6
+
+
 def test_study_of_the_values(tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
     run("cstr_deploy", "--study", "value", "--plot-only", "--out", tmp_path)

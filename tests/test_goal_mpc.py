@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
@@ -132,6 +133,71 @@ def test_robust_problem_equals_its_twin_in_the_deployed_controller():
         expected, v = first_solve(twin, x0)
         assert objective == pytest.approx(expected, rel=1e-5)
         np.testing.assert_allclose(u, v, atol=0.01 * (cstr.U_HIGH - cstr.U_LOW).min())
+
+
+@pytest.mark.parametrize("robust_horizon, solver", [(0, "ipopt"), (1, "ipopt"), (2, "ipopt"), (0, "fatrop")])
+def test_objective_is_that_of_a_naive_loop(robust_horizon, solver):
+    """At a random point: weights, both slack prices, change penalty through the tree, terminal cost at every leaf, a goal per stage."""
+    rng, N, S = np.random.default_rng(1), 3, 2 if robust_horizon else 1
+    x, g, span = ca.SX.sym("x", 4), ca.SX.sym("g", 1), cstr.INIT_HIGH - cstr.INIT_LOW
+    stage = ca.Function("s", [x, g], [ca.sumsqr(x / span) + ca.sin(g) * x[1]])
+    terminal = ca.Function("t", [x, g], [ca.sum1((x / span) ** 3) + g**2 * x[0]])
+    price, price_l2, change = rng.uniform(1, 2, (2, 4)), rng.uniform(1, 2, (2, 4)), rng.uniform(0, 1e-3, 2)
+    price[0, 2] = 0.0  # no lower bound for T_R
+    mpc = gm.ScenarioMPC(cstr, N, cstr.SCENARIOS["mpc"][[0, 5]], stage, terminal, goal=[0.65], robust_horizon=robust_horizon, solver=solver,
+                         slack_price=price, slack_price_l2=price_l2, change_weight=change, compile=False)  # fmt: skip
+    w, goal, before = rng.uniform(-0.5, 0.5, mpc.size["w"]), rng.uniform(-1, 1, (1, N)), rng.uniform(cstr.U_LOW, cstr.U_HIGH)
+    u = [mpc.physical(w, "u", t) for t in range(N)]
+    if solver == "fatrop":  # the carried action is another variable: set it to what it must equal
+        for t in range(N + 1):
+            w[mpc.index["u_before"][t]] = (((u[t - 1] if t else before[:, None]).T - mpc.u_center) / mpc.u_scale).T
+    function = ca.Function("f", [mpc.nlp["x"], mpc.nlp["p"]], [mpc.nlp["f"]])
+    objective = float(function(w, np.concatenate([envs.sample_states(cstr, rng, 1)[0], before, goal.ravel()])))
+    expected = 0.0
+    for t in range(1, N + 1):
+        states, slack, nodes = mpc.physical(w, "x", t), w[mpc.index["slack"][t]], S ** min(t, robust_horizon)
+        for j in range(nodes):
+            expected += float(stage(states[:, j], goal[0, t - 1])) / nodes + (float(terminal(states[:, j], goal[0, -1])) / nodes) * (t == N)
+            for value, (side, i) in zip(slack[:, j], [(0, 0), (0, 1), (0, 3), (1, 0), (1, 1), (1, 2), (1, 3)], strict=True):
+                e = value * span[i] / 2
+                expected += (price[side, i] * e + price_l2[side, i] * e**2) / nodes
+    for t in range(N):
+        nodes = S ** min(t, robust_horizon)
+        for j in range(nodes):
+            last = u[t - 1][:, j // S if t <= robust_horizon else j] if t else before
+            expected += (change * (u[t][:, j] - last) ** 2).sum() / nodes
+    assert objective == pytest.approx(expected, rel=1e-12)
+
+
+def test_hard_bounds_hold_in_a_tree_from_the_first_prediction_on():
+    x, g = ca.SX.sym("x", 4), ca.SX.sym("g", 1)
+    heat = ca.Function("heat", [x, g], [-x[2] / 10])
+    mpc = gm.ScenarioMPC(cstr, 3, cstr.SCENARIOS["mpc"], heat, goal=[0.65], robust_horizon=1, slack_price=np.inf, compile=False)
+    first_solve(mpc, np.array([1.2, 0.6, 137.0, 137.0]))
+    states = np.hstack(mpc.prediction()["x"])
+    assert states.shape == (4, 27) and 139.9 < states[2].max() < 140 + 1e-4
+    mpc.make_step(np.array([1.2, 0.6, 140.5, 120.0]))  # a measured state outside is no contradiction
+    assert mpc.stats["rung"] in ("solved", "retry")
+
+
+def test_guide_and_preview():
+    """The guide's closed loop is the first guess; with preview the controller prepares for a goal that it otherwise learns of later."""
+    guide = pendulum(4, robust_horizon=0)
+    mpc = pendulum(8, robust_horizon=0, guide=guide)
+    guess = mpc.guided_guess(dp.START)
+    x = dp.START
+    guide.reset()
+    for t in range(8):
+        np.testing.assert_allclose(mpc.physical(guess, "x", t)[:, 0], x, atol=1e-9)
+        u = guide.make_step(x)
+        np.testing.assert_allclose(mpc.physical(guess, "u", t)[:, 0], u, atol=1e-9)
+        x = dp.step(x, u, dp.PSI_NOMINAL)
+    plant, (x, g) = linear_plant(), (ca.SX.sym("x", 2), ca.SX.sym("g", 1))
+    cost = ca.Function("c", [x, g], [(x[0] - g) ** 2])
+    mpc = gm.ScenarioMPC(plant, 5, np.ones((1, 1)), cost, goal=[0.0], change_weight=[1e-4], compile=False)
+    goals = np.repeat([[0.0], [1.0]], [6, 6], axis=0)
+    early, late = (gm.simulate(mpc, np.zeros(2), np.ones(1), goals, preview)[0][:, 0] for preview in (True, False))
+    assert np.abs(late[:7]).max() < 1e-3 < np.abs(early[:7]).max() and late[-1] == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
@@ -277,15 +343,8 @@ def test_goal_schedules():
     np.testing.assert_allclose(goals, [[0, np.pi]] * 3 + [[1.5, -0.5]] * 2 + [[0, 0]])
     np.testing.assert_allclose(gm.goal_schedule(cstr, ("0.7",), 2), [[0.7], [0.7]])
     np.testing.assert_allclose(gm.goal_schedule(cstr, (), 1), [cstr.EVAL_GOAL])
-    for bad in (
-        ("sideways",),
-        ("1",),
-        ("1,2,3",),
-        ("up-up", "up-down"),
-        ("up-up", "up-down@4", "up-up@4"),
-        ("9,0",),
-        ("up-up", "up-down@x"),
-    ):
+    bad_schedules = ["sideways"], ["1"], ["1,2,3"], ["up-up", "up-down"], ["up-up", "0,0@4", "up-up@4"], ["9,0"], ["up-up", "0,0@x"]
+    for bad in (*bad_schedules, ["up-up@2"], ["up-up", "up-down@6"]):
         with pytest.raises(ValueError, match="--goal"):
             gm.goal_schedule(dp, bad, 6)
 
@@ -297,6 +356,13 @@ def test_objectives_are_those_of_the_paper():
     assert float(gm.stage_cost(dp, "goal")(x, goal)) == pytest.approx(-np.exp(-squared / 2))
     assert float(gm.stage_cost(dp, "goal", 0.5)(x, goal)) == pytest.approx(-np.exp(-squared))
     assert float(gm.stage_cost(dp, "expert")(x, goal)) == pytest.approx(float(dp.kinetic_energy(x) - dp.potential_energy(x)))
+
+
+def test_the_nominal_plant_leads_every_tree():
+    for scenarios, size in {"nominal": 1, "mpc": 9, "robust": 101}.items():
+        mpc = gm.build_controller(gm.Args(env="cstr", horizon=1, scenarios=scenarios, compile=False, robust_horizon=1))
+        np.testing.assert_array_equal(mpc.scenarios[0], cstr.PSI_NOMINAL)
+        assert len(mpc.scenarios) == size
 
 
 def test_closed_loop_measures_are_those_of_a_naive_loop():
@@ -363,6 +429,10 @@ def test_command_line_end_to_end(extra, files, tmp_path):
         (["--goal", "1,2,3"], ["--goal", "1,2,3", "2 number(s)"]),
         (["--goal", "up-up", "up-down"], ["--goal", "up-down", "@STEP"]),
         (["--goal", "nan,0"], ["--goal", "nan,0"]),
+        (["--goal", "up-up@5"], ["--goal", "up-up@5", "starts at 0"]),
+        (["--goal", "up-up", "up-down@100"], ["--goal", "up-down@100", "below 100"]),
+        (["--goal", "up-down", "--objective", "expert"], ["--objective", "expert", "goal"]),
+        (["--guide-horizon", "75"], ["--guide-horizon", "75", "below"]),
         (["--horizon", "0"], ["--horizon", "0", "[1, "]),
         (["--objective", "expert", "--env", "cstr"], ["--objective", "expert", "quadratic"]),
         (["--objective", "best"], ["objective", "best"]),
