@@ -115,7 +115,7 @@ def plot(args):
           f"{variation['expert', 1] / variation['goal', 1]:.2f} of the goal-conditioned agent's; "
           f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}")  # fmt: skip
     guesses = {"0": "start held"} | {guide: f"closed loop, N = {guide}" for _, guide in columns if guide != "0"}
-    axes[1].set_xticks(range(len(columns)), [f"N = {horizon}\nfirst guess: {guesses[guide]}" for horizon, guide in columns])
+    axes[1].set_xticks(range(len(columns)), [f"N = {horizon}\nfirst guess:\n{guesses[guide]}" for horizon, guide in columns])
     for ax, title in zip(axes, panels.values()):
         ax.set_ylabel(title)
         ax.set_ylim(bottom=0)
