@@ -12,7 +12,7 @@ with the stage cost l chosen by `--objective` (the paper's Example 1) from the p
 goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy.
 
     python goal_mpc.py --env double_pendulum --objective goal --horizon 75          # swing both rods up and hold them
-    python goal_mpc.py --goal up-down down-up@100 up-up@200 --steps 300 --animate   # visit three unstable equilibria
+    python goal_mpc.py --goal up-down down-up@120 --steps 240 --horizon 35 --sigma2 0.5 --animate    # visit two other equilibria
     python goal_mpc.py --env cstr --horizon 20 --robust-horizon 1                   # another plant, a tree of nine scenarios
 
 It writes `runs/{env}__goal_mpc__{seed}__{time}/`: results.csv (a row per seed), trajectories.npz, episode.png and, if asked to,
@@ -26,6 +26,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -678,4 +679,5 @@ def main(args):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program at once; CasADi would take it for a failed solve
     main(tyro.cli(Args, description=__doc__))

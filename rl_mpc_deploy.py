@@ -28,6 +28,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -636,7 +637,8 @@ def run_job(name, args, episode):
 def compare(args):
     """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
     names, found = dict.fromkeys(args.controllers), {}
-    pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"))  # torch does not survive a fork
+    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
+    pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"), **quit_at_once)  # torch does not survive a fork
     try:
         list(pool.map(prepare, names, [args] * len(names)))
         slow_first = sorted(names, key=("robust_mpc", "nominal_mpc", "rl_mpc", "actor").index)
@@ -737,6 +739,8 @@ def check(args):
     low, high = plant.GOAL_REACHABLE
     if ((goal < low) | (goal > high)).any():
         print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)
+    if args.critic is None and not critic_path(args).exists():
+        fail(f"--critic is missing: none is shipped for {args.env}; train one with python sac_her_branching.py --env {args.env}")
     try:
         critic = load_critic(critic_path(args), args.env, args.value)
     except ValueError as error:
@@ -757,6 +761,7 @@ def main(args):
     except RuntimeError as error:
         fail(error)
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}")
+    print("building the controllers; new ones are compiled, which takes half a minute", flush=True)
     tick = time.perf_counter()
     rows, paths = compare(args)
     with open(out / "results.csv", "w", newline="") as file:
@@ -771,4 +776,7 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None

@@ -485,6 +485,8 @@ def check(args):
         fail(f"--hidden is {args.hidden}; it needs at least one width, each at least 1")
     if args.buffer_size < args.num_envs:
         fail(f"--buffer-size is {args.buffer_size}; it must hold at least one transition of each of the {args.num_envs} plants")
+    if args.buffer_size > 10**8:
+        fail(f"--buffer-size is {args.buffer_size}; at most 100000000 transitions are allowed")
     if args.device == "cuda" and not torch.cuda.is_available():
         fail("--device is cuda, but torch finds no CUDA device here; use auto or cpu")
     return plant
@@ -499,7 +501,8 @@ def load_resume(path):
         stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
         return Args(**stored), state
     except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
-        fail(f"--resume {path}: not a resume.pt of this script ({type(error).__name__})")
+        reason = f"not a resume.pt of this script ({type(error).__name__})" if path.exists() else "does not exist"
+        fail(f"--resume {path}: {reason}")
 
 
 def main(args):

@@ -165,6 +165,8 @@ def animate(x, u, predicted, goals, path, every=2):
     ax.legend([rods, ghosts, target, force], ["rods", "prediction", "goal", "force"], loc="upper right", ncols=4, fontsize=8, frameon=False)
     ax.set(ylim=(-1.2, 1.5), aspect="equal", xlabel="position [m]", yticks=[])
     ax.axhline(0, color="grey", lw=1, zorder=0)
+    for end in (X_LOW[0], X_HIGH[0]):
+        ax.plot([end, end], [-0.35, 0.35], color="black", lw=4)  # the track's ends
     view = np.convolve(np.pad(skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid")  # the camera follows the cart
 
     def draw(t):

@@ -461,3 +461,13 @@ def test_help_documents_every_argument():
 def test_default_arguments_are_accepted():
     plant, goals = gm.check(replace(gm.Args(), steps=5))
     assert plant is dp and goals.shape == (5, 2)
+
+
+def test_an_interrupt_ends_the_program_at_once():
+    import signal
+    import time
+
+    process = subprocess.Popen([sys.executable, "goal_mpc.py", "--no-compile", "--steps", "100000"], cwd=ROOT, stderr=subprocess.DEVNULL)
+    time.sleep(8)  # in a solve
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=10) == -signal.SIGINT
