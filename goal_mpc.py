@@ -51,12 +51,20 @@ COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 class Args:
     env: str = "double_pendulum"
     """the plant: NAME of a module envs/NAME.py"""
+    dim: int | None = None
+    """number of states, for a plant that comes in sizes (linear: 2)"""
+    system: int | None = None
+    """which one, for a plant that comes in several (linear: the seed of its matrix, 0)"""
     objective: Literal["expert", "quadratic", "goal"] = "goal"
     """stage cost; expert: what the plant module defines (double_pendulum: kinetic minus potential energy)"""
     horizon: int = 75
     """prediction steps N"""
+    control_horizon: int | None = None
+    """N_c, from which stage on the actions follow the plant's linear feedback (linear: the LQR's); default: never"""
+    gamma: float = 1.0
+    """discount inside the plan"""
     sigma2: float | None = None
-    """sigma^2 of the Gaussian of --objective goal, squared units of the goal error; default: the plant's (1 or 0.01)"""
+    """sigma^2 of the Gaussian of --objective goal, squared units of the goal error; default: the plant's (1, 0.01; linear 0.5)"""
     goal: tuple[str, ...] = ()
     """a name (double_pendulum: up-up, up-down, down-up) or numbers joined by commas; @STEP after it: from that step on.
     Default: the plant's evaluation goal"""
@@ -136,18 +144,21 @@ def compiled_solver(plugin, nlp, options):
 class ScenarioMPC:
     """eq:multiMPCobj by multiple shooting over a scenario tree, with soft constraints and a goal that may change over the horizon.
 
-    stage_cost, terminal_cost: CasADi functions (x, goal) -> scalar, to be minimised; terminal_cost may be None.
+    stage_cost, terminal_cost: CasADi functions (x, goal) -> scalar, to be minimised; terminal_cost may be None. A stage_cost of
+    (x, u, goal) is summed over (x_0, u_0) ... (x_{N-1}, u_{N-1}) instead of x_1 ... x_N, as in eq:nominalMPCobj.
+    gamma: what stands at stage t, slack included, counts gamma^t.
     scenarios: (S, n_psi); the first is the nominal one. robust_horizon: stages at which the tree branches, 0 = nominal.
     slack_price, slack_price_l2: (2, n_x) or scalars, of a violation of X_LOW (first row) and X_HIGH and of its square, per physical
     unit; an infinite slack_price makes a bound hard, 0 ignores it.
     change_weight: (n_u,), price of the squared change of each action.
     solver: "ipopt", or "fatrop" for robust_horizon = 0.
+    law, control_horizon: CasADi function (x, goal) -> u that the actions follow from that stage on, or None.
     guide: another controller for the same plant, of a shorter horizon: its simulated closed loop is the first guess, or None.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=0, discretization="rk4",
-                 slack_price=1.0, slack_price_l2=0.0, change_weight=None, solver="ipopt", guide=None, tol=1e-6,
-                 compile=True):  # fmt: skip
+                 slack_price=1.0, slack_price_l2=0.0, change_weight=None, gamma=1.0, law=None, control_horizon=None, solver="ipopt",
+                 guide=None, tol=1e-6, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         if solver == "fatrop" and robust_horizon:
@@ -163,7 +174,8 @@ class ScenarioMPC:
         self.slack_price_l2 = np.broadcast_to(slack_price_l2, bounds.shape)
         self.hard_bounds = np.where(np.isinf(self.slack_price), bounds, [[-np.inf], [np.inf]])
         self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight, dtype=float)
-        self.solver, self.guide = solver, guide
+        self.solver, self.guide, self.gamma = solver, guide, gamma
+        self.law, self.control_horizon = law, horizon if control_horizon is None else control_horizon
         self.lifted = solver == "fatrop" and self.change_weight.any()  # fatrop's stages must not reach back: carry u_{t-1} as a state
         self._build_tree()
         self._build_layout()
@@ -181,7 +193,7 @@ class ScenarioMPC:
         self.parent = np.concatenate([first[t] + (order[t + 1] // S if t < R else order[t + 1]) for t in range(self.horizon)])
         self.stage = np.repeat(np.arange(self.horizon + 1), self.nodes)  # of every node, the root included
         self.psi = self.scenarios[np.concatenate(order[1:]) % S].T  # (n_psi, nodes)
-        self.weight = 1 / np.array(self.nodes)[self.stage]
+        self.weight = self.gamma**self.stage / np.array(self.nodes)[self.stage]
 
     def _build_layout(self):
         """Where each block (name, stage) lies in w or g: stage after stage, as fatrop needs it and IPOPT does not mind."""
@@ -203,6 +215,8 @@ class ScenarioMPC:
                 block("g", "dynamics", t, self.n_x, n_next)
                 if self.lifted:
                     block("g", "carried", t, self.n_u, n_next)
+                if t >= self.control_horizon:
+                    block("g", "law", t, self.n_u, n)
                 if self.discretization == "radau":
                     block("w", "inside", t, self.n_x * RADAU_DEGREE, n_next)
                     block("g", "collocation", t, self.n_x * RADAU_DEGREE, n_next)
@@ -257,21 +271,31 @@ class ScenarioMPC:
             g.append(("box", distance + slack - np.concatenate([edges[0][below], edges[1][above]])))
             price, price_l2 = (np.concatenate([p[0][below], p[1][above]]) for p in (self.slack_price, self.slack_price_l2))
             J += weight @ (ca.DM(price * scale).T @ slack + ca.DM(price_l2 * scale**2).T @ slack**2).T
-        # stage cost at x_1 ... x_N, terminal cost at every leaf
-        J += weight @ self.stage_cost.map(n)(x[:, children], goal[:, (stage - 1).tolist()]).T
+        # stage cost at x_1 ... x_N, or at (x_0, u_0) ... (x_{N-1}, u_{N-1}); terminal cost at every leaf
+        inner = u.shape[1]  # nodes with children; x_0 has the goal of x_1
+        goal_inner = goal[:, np.maximum(self.stage[:inner] - 1, 0).tolist()]
+        if self.stage_cost.n_in() == 2:
+            J += weight @ self.stage_cost.map(n)(x[:, children], goal[:, (stage - 1).tolist()]).T
+        else:
+            J += ca.DM(self.weight[:inner]).T @ self.stage_cost.map(inner)(x[:, :inner], u, goal_inner).T
         if self.terminal_cost is not None:
             leaves = np.flatnonzero(self.stage == self.horizon).tolist()
-            J += ca.sum2(self.terminal_cost.map(len(leaves))(x[:, leaves], ca.repmat(goal[:, -1], 1, len(leaves)))) / len(leaves)
+            terminal = self.terminal_cost.map(len(leaves))(x[:, leaves], ca.repmat(goal[:, -1], 1, len(leaves)))
+            J += ca.DM(self.weight[leaves]).T @ terminal.T
+        # u_t = law(x_t), N_c <= t
+        if self.control_horizon < self.horizon:
+            late = np.flatnonzero(self.stage[:inner] >= self.control_horizon).tolist()
+            g.append(("law", (u[:, late] - self.law.map(len(late))(x[:, late], goal_inner[:, late])) / self.u_scale))
         # change of the actions
         if self.change_weight.any():
-            before = self.parent[: u.shape[1] - 1].tolist()  # the parent of every node with children, but for the root
+            before = self.parent[: inner - 1].tolist()  # the parent of every node with children, but for the root
             u_before = ca.horzcat(u_now, u[:, before])
             if self.lifted:
                 carried = variable("u_before") * self.u_scale + self.u_center
                 g.append(("carried", (carried[:, children] - u[:, parents]) / self.u_scale))
                 start.append((carried[:, 0] - u_now) / self.u_scale)
-                u_before = carried[:, : u.shape[1]]
-            J += ca.DM(self.weight[: u.shape[1]]).T @ (ca.DM(self.change_weight).T @ (u - u_before) ** 2).T
+                u_before = carried[:, :inner]
+            J += ca.DM(self.weight[:inner]).T @ (ca.DM(self.change_weight).T @ (u - u_before) ** 2).T
         g.append(("start", ca.vertcat(*start)))
         order = np.argsort(np.concatenate([self.positions(name).ravel("F") for name, _ in g]))
         self.nlp = {"x": w, "p": ca.veccat(x_now, u_now, goal), "f": J, "g": ca.veccat(*(value for _, value in g))[order.tolist()]}
@@ -283,6 +307,8 @@ class ScenarioMPC:
         """Prediction over one sampling time: (x, u, psi) -> x_next, or by collocation (x, u, psi, inside) -> x_next, residual."""
         plant, dt = self.plant, self.plant.DT
         x, u, psi = (ca.MX.sym(name, rows) for name, rows in (("x", self.n_x), ("u", self.n_u), ("psi", self.scenarios.shape[1])))
+        if hasattr(plant, "next_state"):  # a discrete-time plant
+            return ca.Function("step", [x, u, psi], [plant.next_state(x, u, psi, ca)])
         xs, us, psis = (ca.SX.sym(v.name(), v.numel()) for v in (x, u, psi))
         if self.discretization == "rk4":
             # one substep is the unit that is differentiated and compiled: unrolled, several take several times as long to compile
@@ -321,7 +347,7 @@ class ScenarioMPC:
         # shifting by one sampling time: block (name, t) takes what stands at (name, t + 1), channel by channel
         self.shift = {"w": np.arange(self.size["w"]), "g": np.arange(self.size["g"])}
         for name, stages in self.index.items():
-            shift = self.shift["g" if name in ("dynamics", "carried", "collocation", "box") else "w"]
+            shift = self.shift["g" if name in ("dynamics", "carried", "law", "collocation", "box") else "w"]
             for t, here in stages.items():
                 if t + 1 in stages and name != "start":
                     shift[here] = stages[t + 1][:, : here.shape[1]]  # under the first scenarios, where the tree branches
@@ -342,7 +368,7 @@ class ScenarioMPC:
         self.goal = np.broadcast_to(goal.reshape(self.n_goal, -1), (self.n_goal, self.horizon))
 
     def set_initial_guess(self, x0):
-        """Forget the previous plan: the next solve starts from `guided_guess` if there is a guide, else from `hold_guess`."""
+        """Forget the previous plan: the next solve starts from the first of `cold_guesses`."""
         envs.checked_state(self.plant, x0)
         self.plan, self.plan_left = None, 0
 
@@ -383,6 +409,16 @@ class ScenarioMPC:
         self.guide.u_before = self.u_before
         return self.rollout_guess(x0, action)
 
+    def baseline_guess(self, x0):
+        """w with the closed loop under the plant's own feedback: a Gaussian is flat far from the goal, so plans should end near it."""
+        return self.rollout_guess(x0, lambda t, x: self.plant.baseline(x, self.goal[:, t]))
+
+    def cold_guesses(self):
+        """The guess that an episode starts from, and another one for when that fails."""
+        if self.guide is not None:
+            return self.guided_guess, self.hold_guess
+        return (self.baseline_guess, self.hold_guess) if hasattr(self.plant, "baseline") else (self.hold_guess, self.drift_guess)
+
     def physical(self, w, name, t):
         """States ("x") or actions ("u") of stage t in w, physical units, (rows, nodes)."""
         center, scale = (self.x_center, self.x_scale) if name == "x" else (self.u_center, self.u_scale)
@@ -410,11 +446,11 @@ class ScenarioMPC:
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
+        first, other = self.cold_guesses()
         if self.plan is None:
-            first, other = (self.guided_guess, self.hold_guess) if self.guide is not None else (self.hold_guess, self.drift_guess)
             solution = self._solve("cold", x0, first(x0))
         else:
-            solution, other = self._solve("warm", x0, *self.plan), self.hold_guess
+            solution, other = self._solve("warm", x0, *self.plan), self.hold_guess if first == self.guided_guess else first
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
             solution = self._solve("cold", x0, other(x0))
@@ -465,30 +501,48 @@ def goal_schedule(plant, texts, steps):
     return goals
 
 
-def stage_cost(plant, objective, sigma2=None):
-    """CasADi function (x, goal) -> cost of `--objective`. Raises ValueError if the plant does not define it."""
-    x, goal = ca.SX.sym("x", len(plant.X_LOW)), ca.SX.sym("goal", len(plant.GOAL_INDEX))
-    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], goal, ca))
+def costs(plant, objective, sigma2=None, gamma=1.0):
+    """Stage and terminal cost (or None) of `--objective`, for ScenarioMPC. Raises ValueError if the plant does not define it.
+
+    A plant with a linear-quadratic regulator has costs l(x, u) and V(x) = x'Px; its objective goal is that of eq:jensen, -exp(-l) and
+    -exp(-V) at the default sigma^2 = 1/2.
+    """
+    x, u, goal = (ca.SX.sym(name, n) for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX))))
+    sigma2 = plant.MPC_SIGMA2 if sigma2 is None else sigma2
+
+    def shaped(cost):
+        return -ca.exp(-cost / (2 * sigma2)) if objective == "goal" else cost
+
     if objective == "expert":
         if not hasattr(plant, "expert_cost"):
             raise ValueError(f"--objective expert is not defined for {plant.ENV_ID}; choose quadratic or goal")
-        cost = plant.expert_cost(x, ca)
-    else:
-        sigma2 = plant.MPC_SIGMA2 if sigma2 is None else sigma2
-        cost = -ca.exp(-squared_error / (2 * sigma2)) if objective == "goal" else squared_error / 2
-    return ca.Function("stage", [x, goal], [cost], {"never_inline": True})
+        return ca.Function("stage", [x, goal], [plant.expert_cost(x, ca)], {"never_inline": True}), None
+    if hasattr(plant, "lqr"):
+        stage = ca.Function("stage", [x, u, goal], [shaped(plant.lq_cost(x, u, goal))], {"never_inline": True})
+        return stage, ca.Function("terminal", [x, goal], [shaped(plant.lq_value(x, goal, gamma))], {"never_inline": True})
+    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], goal, ca))
+    cost = shaped(squared_error) if objective == "goal" else squared_error / 2
+    return ca.Function("stage", [x, goal], [cost], {"never_inline": True}), None
+
+
+def feedback_law(plant, gamma=1.0):
+    """CasADi function (x, goal) -> u of the plant's linear-quadratic regulator, without limits."""
+    x, goal = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
+    return ca.Function("law", [x, goal], [plant.feedback(x, goal, gamma)])
 
 
 def build_controller(args):
     """The controller that the arguments describe, for the plant's evaluation goal."""
-    plant = envs.load(args.env)
+    plant = envs.load(args.env, dim=args.dim, system=args.system)
     guide = build_controller(replace(args, horizon=args.guide_horizon, guide_horizon=0)) if args.guide_horizon else None
     change_weight = plant.EXPERT_CHANGE_WEIGHT if args.change_weight is None and args.objective == "expert" else args.change_weight
     scenarios = plant.SCENARIOS[args.scenarios]
     nominal = (scenarios == plant.PSI_NOMINAL).all(axis=1)
     scenarios = np.concatenate([plant.PSI_NOMINAL[None], scenarios[~nominal]])
-    return ScenarioMPC(plant, args.horizon, scenarios, stage_cost(plant, args.objective, args.sigma2),
-                       goal=plant.EVAL_GOAL, robust_horizon=args.robust_horizon, discretization=args.discretization,
+    law = feedback_law(plant, args.gamma) if args.control_horizon is not None else None
+    return ScenarioMPC(plant, args.horizon, scenarios, *costs(plant, args.objective, args.sigma2, args.gamma), law=law,
+                       goal=plant.EVAL_GOAL, gamma=args.gamma, control_horizon=args.control_horizon,
+                       robust_horizon=args.robust_horizon, discretization=args.discretization,
                        slack_price=np.inf if args.constraints == "hard" else args.slack_weight, slack_price_l2=args.slack_weight_l2,
                        change_weight=change_weight, solver=args.solver, guide=guide, compile=args.compile)  # fmt: skip
 
@@ -615,17 +669,22 @@ def fail(message):
 def check(args):
     """Refuse arguments that cannot work, before anything long starts; returns plant and goals (steps, n_goal)."""
     ranges = {"horizon": (1, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "seed": (0, 10**9),
-              "guide_horizon": (0, 1000), "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6), "slack_weight_l2": (0, 1e6)}  # fmt: skip
+              "guide_horizon": (0, 1000), "gamma": (1e-3, 1), "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6),
+              "slack_weight_l2": (0, 1e6)}  # fmt: skip
     for name, (least, most) in ranges.items():
         value = getattr(args, name)
         if value is not None and not least <= value <= most:  # catches nan too
             fail(f"--{name.replace('_', '-')} is {value}; it must lie in [{least:g}, {most:g}]")
     try:
-        plant = envs.load(args.env)
-        stage_cost(plant, args.objective)
+        plant = envs.load(args.env, dim=args.dim, system=args.system)
+        costs(plant, args.objective)
         goals = goal_schedule(plant, args.goal, args.steps)
     except ValueError as error:
         fail(error)
+    if args.control_horizon is not None and not (hasattr(plant, "lqr") and 0 <= args.control_horizon <= args.horizon):
+        fail(f"--control-horizon is {args.control_horizon}; it needs a plant with a linear feedback and 0 to --horizon {args.horizon}")
+    if args.discretization == "radau" and hasattr(plant, "next_state"):
+        fail(f"--discretization radau needs a differential equation; {args.env} is a discrete-time plant")
     if args.scenarios not in plant.SCENARIOS:
         fail(f"--scenarios {args.scenarios} is not a scenario set of {args.env}; choose one of {', '.join(plant.SCENARIOS)}")
     leaves = len(plant.SCENARIOS[args.scenarios]) ** min(args.robust_horizon, args.horizon)

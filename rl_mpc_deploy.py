@@ -52,6 +52,7 @@ import envs
 
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
 
 
 @dataclass(frozen=True)
@@ -75,16 +76,19 @@ class Args:
 
     robust_horizon: int = 1
     """RL+MPC: stages at which the scenario tree branches; 0: the nominal model alone"""
-    sigma: float = 0.1
-    """RL+MPC: width of the Gaussian stage cost, units of the goal (the paper's text says 0.25, its script 0.1)"""
+    sigma: float | None = None
+    """RL+MPC: width of the Gaussian stage cost, units of the goal; default: the plant's
+    (cstr: 0.1 as in the paper's script; its text says 0.25)"""
     slack_weight: float = 1.0
     """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step"""
     constraints: Literal["soft", "hard"] = "soft"
     """RL+MPC: hard is the paper's variant that gets stuck or infeasible"""
-    value: Literal["min", "first", "mean"] = "first"
+    value: Literal["exact", "taylor", "taylor-local"] = "exact"
+    """RL+MPC: V itself, or its concave second-order expansion about the goal, or about where the previous plan ends"""
+    combine: Literal["min", "first", "mean"] = "first"
     """which of the twin critics V takes; their minimum has kinks, where the solver stalls"""
-    controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "rl_mpc"], ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
-    """which controllers to compare"""
+    controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
+    """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
     """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc)"""
     out: Path | None = None
@@ -128,8 +132,9 @@ class TwinCritic(nn.Module):
 class Critic:
     """Actor and twin critics of a checkpoint in float64: float32 noise (1e-6 at |V| = 40) is above the solver's tolerance."""
 
-    def __init__(self, data, value):
-        self.network, self.goal_input, self.combine = data["network"], data["goal_input"], value
+    def __init__(self, data, combine):
+        self.plant = envs.load(data["env"], **data.get("plant_options", {}))
+        self.network, self.goal_input, self.combine = data["network"], data["goal_input"], combine
         self.actor, self.critic = Actor(**self.network).double(), TwinCritic(**self.network).double()
         self.actor.load_state_dict(data["actor"])
         self.critic.load_state_dict(data["critic"])
@@ -155,7 +160,7 @@ class Critic:
         return {"min": q.amin(0), "first": q[0], "mean": q.mean(0)}[self.combine]
 
 
-def load_critic(path, env, value="first"):
+def load_critic(path, env, combine="first"):
     """The actor and critic stored in a checkpoint.pt. Raises ValueError, one sentence, for anything else."""
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
@@ -163,7 +168,7 @@ def load_critic(path, env, value="first"):
             raise KeyError
         if data["env"] != env:
             raise ValueError(f"{path} was trained on {data['env']!r}, not on {env!r}; --env and --critic must match")
-        critic = Critic(data, value)
+        critic = Critic(data, combine)
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist; it must be a checkpoint.pt written by sac_her_branching.py") from None
     except ValueError:
@@ -202,9 +207,9 @@ def export(critic):
     return mu, Q, V
 
 
-def check_export(critic, V, plant, points=64, tolerance=1e-8):
+def check_export(critic, V, points=64, tolerance=1e-8):
     """Compare value and gradient with torch at random states; returns the largest scaled difference, raises if it is too large."""
-    rng = np.random.default_rng(0)
+    plant, rng = critic.plant, np.random.default_rng(0)
     x = torch.tensor(envs.sample_states(plant, rng, points), requires_grad=True)
     goal = torch.tensor(rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW))))
     value = critic.value(x, goal)
@@ -219,6 +224,47 @@ def check_export(critic, V, plant, points=64, tolerance=1e-8):
     if not worst < tolerance:
         raise RuntimeError(f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run")
     return worst
+
+
+class TaylorValue:
+    """V(., goal) replaced by its second-order expansion, for a solver that then needs no derivatives of a network.
+
+    -V need not be convex, and a quadratic terminal cost that is not has its minimum at the end of the world. So its Hessian, in units of
+    the box of initial states, is projected: negative eigenvalues become zero.
+    """
+
+    def __init__(self, critic, goal):
+        self.n, self.goal = len(critic.scaling["x_center"]), torch.tensor(goal)
+        self.center, self.scale = (torch.tensor(critic.scaling[f"x_{k}"]) for k in ("center", "scale"))
+
+        def value(z):  # of one state in units of the box
+            return critic.value((z * self.scale + self.center)[None], self.goal[None])[0]
+
+        def slope(z):
+            v = value(z)
+            return torch.func.grad(value)(z), v
+
+        def expansion(z):
+            hessian, (gradient, v) = torch.func.jacrev(lambda y: (lambda g: (g[0], g))(slope(y)), has_aux=True)(z)
+            return hessian, gradient, v
+
+        self.derivatives = torch.func.vmap(expansion)
+        # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
+        x, theta = ca.MX.sym("x", self.n), ca.MX.sym("theta", 1 + 2 * self.n + self.n**2)
+        z0, v0, slope0, curvature = ca.vertsplit(theta, np.cumsum([0, self.n, 1, self.n, self.n**2]).tolist())
+        dz = (x - self.center.numpy()) / self.scale.numpy() - z0
+        self.cost = ca.Function(
+            "taylor", [x, theta], [v0 + ca.dot(slope0, dz) + ca.bilin(ca.reshape(curvature, self.n, self.n), dz, dz) / 2]
+        )
+
+    def parameters(self, x):
+        """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points)."""
+        z = (torch.tensor(x.T) - self.center) / self.scale
+        with torch.no_grad():
+            hessian, gradient, value = self.derivatives(z)
+            eigenvalues, vectors = torch.linalg.eigh(-hessian)
+            curvature = vectors * eigenvalues.clamp(min=0)[:, None] @ vectors.mT
+        return torch.cat([z, -value[:, None], -gradient, curvature.flatten(1)], dim=1).T.numpy()
 
 
 # Scenario MPC
@@ -265,15 +311,17 @@ class ScenarioMPC:
     relaxed_price: if given, an unsuccessful solve is repeated with every bound soft at this price.
     change_weight: (n_u,), price of the squared change of each action, summed over scenarios.
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
+    taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: the state (n_x,) to expand at, or
+    None for where each scenario's guess ends.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
-                 relaxed_price=None, change_weight=None, actor=None, tol=1e-6, compile=True):  # fmt: skip
+                 relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, tol=1e-6, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
         self.scenarios = np.asarray(scenarios if robust_horizon else scenarios[:1])
-        self.stage_cost, self.terminal_cost = stage_cost, terminal_cost
+        self.stage_cost, self.terminal_cost, self.taylor, self.expand_at = stage_cost, terminal_cost, taylor, expand_at
         self.goal = np.array(goal, dtype=float)
         self.n_x, self.n_u = len(plant.X_LOW), len(plant.U_LOW)
         self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
@@ -283,6 +331,9 @@ class ScenarioMPC:
         self.box = (plant.X_LOW - self.x_center) / self.x_scale, (plant.X_HIGH - self.x_center) / self.x_scale
         self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
         self._build_tree()
+        self.theta = np.empty((0, self.nodes[-1])) if taylor is None else taylor.parameters(np.zeros((self.n_x, self.nodes[-1])))
+        if expand_at is not None:
+            self.theta[:] = taylor.parameters(np.asarray(expand_at)[:, None])
         self._build_problem()
         self._build_solvers(compile, tol)
         self.reset()
@@ -299,6 +350,7 @@ class ScenarioMPC:
         n_x, n_u = self.n_x, self.n_u
         x_now, goal, u_before = ca.MX.sym("x_now", n_x), ca.MX.sym("goal", len(self.goal)), ca.MX.sym("u_before", n_u)
         price = ca.MX.sym("price", n_x, 2)  # of slack below and above
+        theta = ca.MX.sym("theta", *self.theta.shape)  # of the terminal value's expansion at every leaf
         w, lbw, ubw, J, g, lbg, ubg = [], [], [], 0, [], [], []
         self.layout = {}  # (name, stage): first index into w or g, rows, nodes
         step = self._model_step()
@@ -336,7 +388,9 @@ class ScenarioMPC:
             # not averaged, as in the reference: every action's change counts once for each scenario that passes through its node
             J += self.nodes[-1] / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
             x, u_parent = x_next, u
-        self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price), "f": J, "g": ca.veccat(*g)}
+        if self.taylor is not None:
+            J += ca.sum2(self.taylor.cost.map(self.nodes[-1])(x, theta)) / self.nodes[-1]
+        self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price, theta), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
         self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
         self.step = step
@@ -350,6 +404,9 @@ class ScenarioMPC:
 
     def _model_step(self):
         """Prediction model (x, u, psi) -> x one sampling time later."""
+        if hasattr(self.plant, "next_state"):  # a discrete-time plant
+            x, u, psi = ca.MX.sym("x", self.n_x), ca.MX.sym("u", self.n_u), ca.MX.sym("psi", self.scenarios.shape[1])
+            return ca.Function("step", [x, u, psi], [self.plant.next_state(x, u, psi, ca)])
         x, u, psi = ca.SX.sym("x", self.n_x), ca.SX.sym("u", self.n_u), ca.SX.sym("psi", self.scenarios.shape[1])
         dt, plant = self.plant.DT / self.plant.MODEL_SUBSTEPS, self.plant
         # one substep is the unit that is differentiated and compiled: unrolled, the four take three times as long to compile
@@ -421,8 +478,12 @@ class ScenarioMPC:
         return w
 
     def cold_guess(self, x0):
-        """A plan from nothing: the actor's rollout through the scenarios, or without an actor `hold_guess`."""
-        return self.hold_guess(x0) if self.actor is None else self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+        """A plan from nothing: the rollout through the scenarios of the actor, or of the plant's own feedback, or `hold_guess`."""
+        if self.actor is not None:
+            return self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+        if hasattr(self.plant, "baseline"):
+            return self._rollout(x0, lambda t, x: self.plant.baseline(x, self.goal[:, None]))
+        return self.hold_guess(x0)
 
     def set_initial_guess(self, x0):
         """Forget the previous plan: the next solve starts from `cold_guess`."""
@@ -430,7 +491,7 @@ class ScenarioMPC:
         self.plan, self.plan_left = None, 0
 
     def _parameters(self, x0, price):
-        return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel()])
+        return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel(), self.theta.ravel("F")])
 
     def _bounds(self, price):
         """Bounds of the problem under a slack price: slack is fixed at zero where a bound is hard (inf) or ignored (0)."""
@@ -441,6 +502,16 @@ class ScenarioMPC:
                 self.block(bounds["ubx"], name, t)[(p == 0) | np.isinf(p)] = 0.0
                 self.block(bounds[bound], "box", t)[p == 0] = no_bound
         return bounds
+
+    def _expand(self, w):
+        """With a Taylor value and no fixed point to expand at: expand where each scenario of w ends."""
+        if self.taylor is not None and self.expand_at is None:
+            self.theta = self.taylor.parameters(self.physical(w, "x", self.horizon))
+
+    def _cost(self, x0, w):
+        """Objective of a plan with its dynamics satisfied; a hard bound is dear in this comparison."""
+        self._expand(w)
+        return self.objective(w, self._parameters(x0, np.minimum(self.slack_price, 1e3)))
 
     def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
         """One call of IPOPT: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
@@ -467,9 +538,9 @@ class ScenarioMPC:
         if self.plan is not None:
             w, *multipliers = self.plan
             shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
-            parameters = self._parameters(x0, np.minimum(self.slack_price, 1e3))  # a hard bound is dear in this comparison
-            if self.actor is None or self.objective(shifted, parameters) <= self.objective(cold, parameters):
+            if self.actor is None or self._cost(x0, shifted) <= self._cost(x0, cold):
                 start = "warm"
+        self._expand(shifted if start == "warm" else cold)
         solution = self._solve(start, x0, self.slack_price, *((shifted, *multipliers) if start == "warm" else (cold,)))
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
@@ -549,26 +620,43 @@ class GreedyController(ActorController):
 
 def build_controller(name, args):
     """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc" or "rl_mpc"."""
-    plant = envs.load(args.env)
-    goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal)
     greedy = name == "rl_mpc" and args.horizon == 0
-    mu, Q, V = export(load_critic(critic_path(args), args.env, "min" if greedy else args.value))
+    critic = load_critic(critic_path(args), args.env, "min" if greedy else args.combine)
+    plant, (mu, Q, V) = critic.plant, export(critic)
+    goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
     if name == "actor":
         return ActorController(plant, mu, goal)
     if greedy:
         return GreedyController(plant, mu, Q, goal)
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
     squared_error, scenarios = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca)), plant.SCENARIOS["mpc"]
-    if name == "rl_mpc":
-        stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * args.sigma**2))])
-        return ScenarioMPC(plant, args.horizon, scenarios, stage, ca.Function("terminal", [x, g], [-V(x, g)]),
-                           goal=goal, robust_horizon=args.robust_horizon, actor=mu, compile=args.compile,
-                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf)  # fmt: skip
+    if name in ("rl_mpc", "goal_mpc"):
+        sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
+        stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
+        learned = {}
+        if name == "rl_mpc" and args.value == "exact":
+            learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
+        elif name == "rl_mpc":
+            point = settled_state(plant, mu, goal) if args.value == "taylor" else None
+            learned = dict(actor=mu, taylor=TaylorValue(critic, goal), expand_at=point)
+        return ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=args.compile,
+                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
                        compile=args.compile)  # fmt: skip
+
+
+def settled_state(plant, mu, goal, steps=1000):
+    """The state that a goal stands for: the goal itself if it names every state, else where the nominal loop under the actor settles."""
+    x = np.array(plant.START)
+    if len(plant.GOAL_INDEX) == len(x):
+        x[plant.GOAL_INDEX] = goal
+        return x
+    for _ in range(steps):
+        x = plant.step(x, np.array(mu(x, goal)).ravel(), plant.PSI_NOMINAL)
+    return x
 
 
 def critic_path(args):
@@ -641,7 +729,7 @@ def compare(args):
     pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"), **quit_at_once)  # torch does not survive a fork
     try:
         list(pool.map(prepare, names, [args] * len(names)))
-        slow_first = sorted(names, key=("robust_mpc", "nominal_mpc", "rl_mpc", "actor").index)
+        slow_first = sorted(names, key=("robust_mpc", "nominal_mpc", "rl_mpc", "goal_mpc", "actor").index)
         futures = [pool.submit(run_job, name, args, i) for name in slow_first for i in range(args.episodes)]
         for future in tqdm(as_completed(futures), total=len(futures), unit="episode", disable=None):
             name, episode, *result = future.result()
@@ -656,8 +744,10 @@ def compare(args):
 # Table and figure
 
 
-LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC", "rl_mpc": "RL+MPC"}
-STYLES = {"actor": ("#D55E00", "--"), "nominal_mpc": ("#999999", ":"), "robust_mpc": ("#0072B2", "-."), "rl_mpc": ("#009E73", "-")}
+LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC", "goal_mpc": "RL+MPC, no value",
+          "rl_mpc": "RL+MPC"}  # fmt: skip
+STYLES = {"actor": ("#D55E00", "--"), "nominal_mpc": ("#999999", ":"), "robust_mpc": ("#0072B2", "-."),
+          "goal_mpc": ("#E69F00", (0, (4, 1, 1, 1, 1, 1))), "rl_mpc": ("#009E73", "-")}  # fmt: skip
 
 
 def label(row):
@@ -719,17 +809,22 @@ def fail(message):
 
 def check(args):
     """Refuse arguments that cannot work, before anything long starts; returns plant, goal and critic."""
-    try:
-        plant = envs.load(args.env)
-    except ValueError as error:
-        fail(error)
+    if args.env not in envs.names():
+        fail(f"--env {args.env!r} is not a plant of envs/; choose one of {', '.join(envs.names())}")
     ranges = {"horizon": (0, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "jobs": (1, 1024),
               "seed": (0, 10**9), "sigma": (1e-6, 1e6), "slack_weight": (1e-6, 1e6)}  # fmt: skip
     for name, (least, most) in ranges.items():
-        if not least <= getattr(args, name) <= most:  # catches nan too
+        if getattr(args, name) is not None and not least <= getattr(args, name) <= most:  # catches nan too
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{least:g}, {most:g}]")
     if not args.controllers:
         fail(f"--controllers is empty; choose from {', '.join(LABELS)}")
+    if args.critic is None and not critic_path(args).exists():
+        fail(f"--critic is missing: none is shipped for {args.env}; train one with python sac_her_branching.py --env {args.env}")
+    try:
+        critic = load_critic(critic_path(args), args.env, args.combine)
+    except ValueError as error:
+        fail(f"--critic {error}")
+    plant = critic.plant
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
     if leaves > 1000:
         fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
@@ -739,12 +834,6 @@ def check(args):
     low, high = plant.GOAL_REACHABLE
     if ((goal < low) | (goal > high)).any():
         print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)
-    if args.critic is None and not critic_path(args).exists():
-        fail(f"--critic is missing: none is shipped for {args.env}; train one with python sac_her_branching.py --env {args.env}")
-    try:
-        critic = load_critic(critic_path(args), args.env, args.value)
-    except ValueError as error:
-        fail(f"--critic {error}")
     return plant, goal, critic
 
 
@@ -757,7 +846,7 @@ def main(args):
     except OSError as error:
         fail(f"--out {out}: cannot write there ({error.strerror})")
     try:
-        difference = check_export(critic, export(critic)[2], plant)
+        difference = check_export(critic, export(critic)[2])
     except RuntimeError as error:
         fail(error)
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}")

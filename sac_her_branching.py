@@ -40,17 +40,25 @@ from tqdm import tqdm
 
 import envs
 
+# of the arguments that a plant's TRAINING may set
+DEFAULTS = {"hidden": (64, 64), "total_timesteps": 100_000, "num_envs": 32, "gamma": 0.99, "steps_per_update": 8, "learning_starts": 1_000,
+            "buffer_size": 200_000, "alpha_init": 1.0}  # fmt: skip
+
 
 @dataclass
 class Args:
     env: str = "cstr"
     """the plant: NAME of a module envs/NAME.py"""
+    dim: int | None = None
+    """number of states, for a plant that comes in sizes (linear: 2)"""
+    system: int | None = None
+    """which one, for a plant that comes in several (linear: the seed of its matrix, 0)"""
     seed: int = 0
     """seed of networks, plants, exploration and replay; same seed, same machine, same numbers"""
-    total_timesteps: int = 100_000
-    """transitions to collect, over all parallel plants"""
-    num_envs: int = 32
-    """plants simulated in parallel"""
+    total_timesteps: int | None = None
+    """transitions to collect, over all parallel plants; default: the plant's (cstr: 100000)"""
+    num_envs: int | None = None
+    """plants simulated in parallel; default: the plant's (cstr: 32)"""
     scenarios: Literal["robust", "nominal", "mpc"] = "robust"
     """where psi is drawn from at every step: the training grid, the nominal plant, or the MPC's scenario set"""
     branches: int = 1
@@ -75,10 +83,10 @@ class Args:
     goal_input: Literal["error", "goal"] = "error"
     """what the networks see beside the state: goal minus achieved goal, or the goal itself"""
 
-    hidden: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers of actor and critics (SiLU)"""
-    gamma: float = 0.99
-    """discount"""
+    hidden: tuple[int, ...] | None = None
+    """widths of the hidden layers of actor and critics (SiLU); default: the plant's (cstr: 64 64)"""
+    gamma: float | None = None
+    """discount; default: the plant's (cstr: 0.99)"""
     tau: float = 0.02
     """step of the target networks towards the critics after each update"""
     batch_size: int = 256
@@ -87,16 +95,18 @@ class Args:
     """of actor, critics and entropy coefficient (Adam), at the start"""
     learning_rate_end: float = 0.0
     """learning rate at the end of the run, as a share of the initial one (it falls linearly)"""
-    learning_starts: int = 1_000
-    """transitions with uniformly random actions before the first update"""
-    steps_per_update: int = 8
-    """transitions collected per update"""
+    learning_starts: int | None = None
+    """transitions with uniformly random actions before the first update; default: the plant's (cstr: 1000)"""
+    steps_per_update: int | None = None
+    """transitions collected per update; default: the plant's (cstr: 8)"""
     entropy_in_target: bool = True
     """SAC's soft value; off: the critic counts reward alone, the actor still maximises Q plus entropy"""
-    buffer_size: int = 200_000
-    """transitions that the replay buffer holds"""
+    buffer_size: int | None = None
+    """transitions that the replay buffer holds; default: the plant's (cstr: 200000)"""
     target_entropy: float | None = None
-    """entropy that the coefficient alpha is tuned to; default: minus the number of actions"""
+    """entropy that the coefficient alpha is tuned to; default: the plant's (cstr: minus the number of actions)"""
+    alpha_init: float | None = None
+    """entropy coefficient at the start; default: the plant's (cstr: 1)"""
 
     eval_every: int = 10_000
     """transitions between evaluations; 0: only at the end"""
@@ -108,6 +118,18 @@ class Args:
     """a resume.pt: continue that run in its folder, with the arguments that it was started with"""
     out: Path = Path("runs")
     """folder that the run's own folder is made in"""
+
+    def __post_init__(self):
+        """Arguments left out take the plant's value."""
+        if self.env in envs.names():
+            for name, value in (DEFAULTS | envs.load(self.env).TRAINING).items():
+                if getattr(self, name) is None:
+                    setattr(self, name, value)
+
+    @property
+    def plant_options(self):
+        """What `envs.load` needs beside the plant's name."""
+        return {name: getattr(self, name) for name in ("dim", "system") if getattr(self, name) is not None}
 
 
 # Networks. They see normalised inputs; `Scaling` is the only place where physical units are left and entered.
@@ -225,7 +247,7 @@ class Policy:
 def load_policy(path, device="cpu"):
     """The agent stored in a checkpoint.pt."""
     data = torch.load(path, map_location=device, weights_only=True)
-    plant = envs.load(data["env"])
+    plant = envs.load(data["env"], **data.get("plant_options", {}))
     actor, critic = Actor(**data["network"]).to(device), TwinCritic(**data["network"]).to(device)
     actor.load_state_dict(data["actor"])
     critic.load_state_dict(data["critic"])
@@ -306,7 +328,7 @@ class SAC:
             self.critic = TwinCritic(**self.network).to(device)
             self.target = TwinCritic(**self.network).to(device).requires_grad_(False)
         self.target.load_state_dict(self.critic.state_dict())
-        self.log_alpha = torch.zeros(1, requires_grad=True, device=device)
+        self.log_alpha = torch.tensor([args.alpha_init], device=device).log().requires_grad_()
         self.target_entropy = -float(n_u) if args.target_entropy is None else args.target_entropy
         self.generator = torch.Generator(device=device).manual_seed(args.seed)
 
@@ -437,6 +459,7 @@ def checkpoint(agent, args, step):
     return {
         "format": "rlmpc-sac-her-branching-1",
         "env": args["env"],
+        "plant_options": {name: args[name] for name in ("dim", "system") if args[name] is not None},
         "env_id": agent.plant.ENV_ID,
         "network": agent.network,
         "goal_input": args["goal_input"],
@@ -466,14 +489,14 @@ def fail(message):
 def check(args):
     """Refuse arguments that cannot work, before anything long starts; returns the plant module."""
     try:
-        plant = envs.load(args.env)
+        plant = envs.load(args.env, **args.plant_options)
     except ValueError as error:
         fail(error)
     ranges = {
         (1, 10**9): ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"),
         (0, 10**9): ("seed", "learning_starts", "eval_every", "save_every", "constraint_weight"),
         (0, 1): ("her_ratio", "gamma", "tau", "learning_rate_end"),
-        (1e-9, 1e3): ("learning_rate", "reward_sigma2", "reward_tolerance"),
+        (1e-9, 1e3): ("learning_rate", "reward_sigma2", "reward_tolerance", "alpha_init"),
         (-1e3, 1e3): ("target_entropy",),
     }
     for (low, high), names in ranges.items():
@@ -528,7 +551,7 @@ def main(args):
 
     vec = gym.make_vec(plant.ENV_ID, num_envs=args.num_envs, scenarios=args.scenarios, smooth_reward=args.smooth_reward,
                        reward_sigma2=args.reward_sigma2, reward_tolerance=args.reward_tolerance,
-                       branches=args.branches if args.branches > 1 else 0).unwrapped  # fmt: skip
+                       branches=args.branches if args.branches > 1 else 0, **args.plant_options).unwrapped  # fmt: skip
     agent = SAC(args, plant, device)
     buffer = HERBuffer(args.buffer_size, args.num_envs, len(plant.X_LOW), len(plant.U_LOW), len(plant.GOAL_INDEX),
                        plant.GOAL_INDEX, args.branches, args.her_strategy, args.her_ratio, device)  # fmt: skip
@@ -606,10 +629,10 @@ def main(args):
     if interrupted:
         print(f"interrupted at step {step}; continue with: python sac_her_branching.py --resume {run_dir / 'resume.pt'}")
         raise SystemExit(130)
-    last = rows[-1]
+    last, goal = rows[-1], np.array2string(plant.EVAL_GOAL, threshold=4, edgeitems=1)
     print(f"""
 {plant.ENV_ID}, {args.scenarios} scenarios, seed {args.seed}: {step} transitions, {updates} updates in {seconds:.0f} s
-absolute percentage error, goal {plant.EVAL_GOAL}   median   75th percentile
+absolute percentage error, goal {goal}   median   75th percentile
   robust evaluation, all plants      {last["robust_median_ape"]:10.2f} {last["robust_p75_ape"]:12.2f}
   robust evaluation, held-out plants {last["robust_held_out_median_ape"]:10.2f}
   nominal evaluation                 {last["nominal_median_ape"]:10.2f} {last["nominal_p75_ape"]:12.2f}

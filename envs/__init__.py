@@ -62,11 +62,19 @@ def names():
     return sorted(module.name for module in pkgutil.iter_modules(__path__))
 
 
-def load(name):
-    """The plant module `envs/NAME.py`. Raises ValueError, with the list of what is there, if there is none."""
+def load(name, **options):
+    """The plant module `envs/NAME.py`, or what its `make(**options)` returns if it has one; options that are None are left out.
+
+    Raises ValueError, one sentence, for a plant that is not there (with the list of what is) or an option that it does not take.
+    """
     if name not in names():
         raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(names())}")
-    return importlib.import_module(f"{__name__}.{name}")
+    module, options = importlib.import_module(f"{__name__}.{name}"), {k: v for k, v in options.items() if v is not None}
+    if hasattr(module, "make"):
+        return module.make(**options)
+    if options:
+        raise ValueError(f"--{next(iter(options))} is not an option of --env {name}, which is a single plant")
+    return module
 
 
 def sample_states(plant, rng, n):
@@ -101,8 +109,8 @@ def checked_state(plant, x0):
 class _PlantSpaces:
     """Spaces and observation layout that the single and the batched environment share."""
 
-    def _set_plant(self, plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance):
-        self.plant = load(plant)
+    def _set_plant(self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance):
+        self.plant = load(plant, **options)
         if scenarios not in self.plant.SCENARIOS:
             raise ValueError(f"scenarios={scenarios!r} is not one of {', '.join(self.plant.SCENARIOS)}")
         self.scenarios = self.plant.SCENARIOS[scenarios]
@@ -138,8 +146,8 @@ class GoalEnv(_PlantSpaces, gym.Env):
 
     metadata = {"render_modes": []}
 
-    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None):
-        self._set_plant(plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None, **options):
+        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
         self.observation_space, self.action_space = self._single_observation_space, self._single_action_space
 
     def reset(self, *, seed=None, options=None):
@@ -169,8 +177,8 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
-                 branches=0, max_episode_steps=None):  # fmt: skip
-        self._set_plant(plant, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+                 branches=0, max_episode_steps=None, **options):  # fmt: skip
+        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
         self.single_observation_space, self.single_action_space = self._single_observation_space, self._single_action_space

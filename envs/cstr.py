@@ -59,6 +59,7 @@ ERROR_SCALE = np.array([0.05])  # mol/l; five standard deviations of the trainin
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
 MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
+TRAINING = {}
 MPC_SIGMA2 = 0.01  # (mol/l)^2, of the stage cost in the authors' script; the paper's text says 0.0625
 
 K0_AB = 1.287e12  # 1/h, rate constants (Table 1)

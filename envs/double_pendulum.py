@@ -58,6 +58,7 @@ GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)
 ERROR_SCALE = np.ones(2)  # not used: both goals are angles
 REWARD_SIGMA2 = 0.01  # of 1 - cos(error), eq:smoothreward in the paper's "time near goal"
 REWARD_TOLERANCE = 0.02  # 1 - cos of 0.2 rad
+TRAINING = {}
 MPC_SIGMA2 = 1.0  # eq:smoothreward as the stage cost of goal_mpc.py
 MODEL_SUBSTEPS = 2  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
 

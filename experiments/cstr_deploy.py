@@ -40,8 +40,8 @@ STUDIES = {  # name: {label: settings of rl_mpc_deploy.py}
     },
     "value": {
         "first critic": dict(controllers=("rl_mpc",)),
-        "minimum of both critics": dict(controllers=("rl_mpc",), value="min"),
-        "mean of both critics": dict(controllers=("rl_mpc",), value="mean"),
+        "minimum of both critics": dict(controllers=("rl_mpc",), combine="min"),
+        "mean of both critics": dict(controllers=("rl_mpc",), combine="mean"),
         "no entropy in the target": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_no_entropy.pt"),
     },
 }

@@ -59,7 +59,7 @@ def test_export_equals_torch_in_value_gradient_and_hessian(checkpoint, tmp_path,
     torch.save(data, tmp_path / "c.pt")
     critic = deploy.load_critic(tmp_path / "c.pt", "cstr", value)
     _, _, V = deploy.export(critic)
-    assert deploy.check_export(critic, V, cstr) < 1e-12
+    assert deploy.check_export(critic, V) < 1e-12
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
     hessian = ca.Function("h", [x, g], [ca.hessian(V(x, g), x)[0]])
     rng = np.random.default_rng(1)
@@ -76,7 +76,7 @@ def test_a_wrong_export_stops_the_program(checkpoint):
     with torch.no_grad():
         critic.critic.bias[0] += 1e-3
     with pytest.raises(RuntimeError, match="differs from torch"):
-        deploy.check_export(critic, V, cstr)
+        deploy.check_export(critic, V)
 
 
 def test_both_scripts_read_a_checkpoint_alike(checkpoint):
@@ -346,7 +346,8 @@ def test_horizon_zero_and_hard_constraints_from_the_command_line(checkpoint, tmp
         (["--controllers", "pid"], ["controllers", "pid", "rl_mpc"]),
         (["--slack-weight", "inf"], ["--slack-weight", "inf"]),
         (["--sigma", "0"], ["--sigma", "0.0"]),
-        (["--value", "max"], ["value", "min"]),
+        (["--combine", "max"], ["combine", "min"]),
+        (["--value", "linear"], ["value", "taylor"]),
         (["--robust-horizon", "5"], ["--robust-horizon", "5", "leaves"]),
     ],
 )

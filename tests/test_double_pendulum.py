@@ -128,7 +128,7 @@ def test_training_and_deployment_run_on_it(tmp_path):
         torch.save(data, tmp_path / "c.pt")
         critic = deploy.load_critic(tmp_path / "c.pt", "double_pendulum")
         mu, _, V = deploy.export(critic)
-        assert deploy.check_export(critic, V, dp) < 1e-12
+        assert deploy.check_export(critic, V) < 1e-12
         policy = training.load_policy(tmp_path / "c.pt")
         np.testing.assert_allclose(np.array(mu(dp.START, [0.1, 3.0])).ravel(), policy.act(x, [0.1, 3.0])[0], atol=1e-3)
     args = deploy.Args(env="double_pendulum", critic=run / "checkpoint.pt", horizon=2, episodes=1, steps=3, jobs=1, compile=False,

@@ -50,7 +50,7 @@ def pendulum(horizon=12, objective="goal", **options):
     """The controller with one of the paper's objectives, or with "steep": quadratic in the state, so that optima are sharp."""
     x, g = ca.SX.sym("x", 6), ca.SX.sym("g", 2)
     steep = ca.Function("steep", [x, g], [ca.sumsqr(x[1:3] - g) + 0.1 * ca.sumsqr(x)])
-    stage = steep if objective == "steep" else gm.stage_cost(dp, objective)
+    stage = steep if objective == "steep" else gm.costs(dp, objective)[0]
     settings = dict(goal=dp.EVAL_GOAL, compile=False) | options
     return gm.ScenarioMPC(dp, horizon, settings.pop("scenarios", dp.SCENARIOS["mpc"]), stage, **settings)
 
@@ -352,10 +352,10 @@ def test_goal_schedules():
 def test_objectives_are_those_of_the_paper():
     x, goal = np.array([0.2, 0.4, 2.0, 0.3, -1.0, 2.0]), np.array([0.0, np.pi])
     squared = (1 - np.cos(0.4)) ** 2 + (1 - np.cos(2.0 - np.pi)) ** 2
-    assert float(gm.stage_cost(dp, "quadratic")(x, goal)) == pytest.approx(squared / 2)
-    assert float(gm.stage_cost(dp, "goal")(x, goal)) == pytest.approx(-np.exp(-squared / 2))
-    assert float(gm.stage_cost(dp, "goal", 0.5)(x, goal)) == pytest.approx(-np.exp(-squared))
-    assert float(gm.stage_cost(dp, "expert")(x, goal)) == pytest.approx(float(dp.kinetic_energy(x) - dp.potential_energy(x)))
+    assert float(gm.costs(dp, "quadratic")[0](x, goal)) == pytest.approx(squared / 2)
+    assert float(gm.costs(dp, "goal")[0](x, goal)) == pytest.approx(-np.exp(-squared / 2))
+    assert float(gm.costs(dp, "goal", 0.5)[0](x, goal)) == pytest.approx(-np.exp(-squared))
+    assert float(gm.costs(dp, "expert")[0](x, goal)) == pytest.approx(float(dp.kinetic_energy(x) - dp.potential_energy(x)))
 
 
 def test_the_nominal_plant_leads_every_tree():

@@ -1,0 +1,143 @@
+"""Random linear systems x' = A x + u, the paper's Example 2 (its sections app:lqr and app:LQ-GC): `--env linear --dim N --system SEED`.
+
+Unlike the other modules, this one is a family of plants: `make(dim, system)` returns one of them, an object with the names that a plant
+module has. There is nothing uncertain about it: psi has no entries.
+"""
+
+from functools import cache
+
+import numpy as np
+
+STEPS = 50
+SPECTRAL_RADIUS = 1.1  # at most
+SINGULAR_VALUE_MIN = 0.1  # of tanh(D), so that A has an inverse that is not huge
+CONDITION_MAX = 10.0  # of L at off_diagonal = 1; another is drawn where it is larger
+STATE_BOUND = 1.5  # soft, of every state; initial states lie in [-1, 1]
+
+
+def random_matrix(n, rng, off_diagonal=1.0, entries="symmetric"):
+    """A random (n, n) matrix with spectral radius at most 1.1 and the L that made it (section app:LQ-GC).
+
+    M = U tanh(D) V' from the singular value decomposition of a matrix with entries uniform in [-1, 1] ("symmetric") or in [0, 1]
+    ("positive"), its singular values clipped and scaled to [0.11, 1.1]; then A = L^-1 M L. What the paper leaves open: the triangular L
+    has entries uniform in [-off_diagonal, off_diagonal] / sqrt(n) below a diagonal uniform in [0.5, 1.5], and a condition number of at
+    most 10. With entries that do not shrink with n, L and with it the norm of A grow without bound (a median norm of 4e6 at n = 32).
+    """
+    u, d, vt = np.linalg.svd(rng.uniform(-1 if entries == "symmetric" else 0, 1, size=(n, n)))
+    m = u @ np.diag(SPECTRAL_RADIUS * np.clip(np.tanh(d), SINGULAR_VALUE_MIN, 1)) @ vt
+    while True:
+        below = np.tril(rng.uniform(-off_diagonal, off_diagonal, size=(n, n)) / np.sqrt(n), -1)
+        transform = below + np.diag(rng.uniform(0.5, 1.5, size=n))
+        if np.linalg.cond(transform) <= CONDITION_MAX * max(1, off_diagonal) ** 2:
+            return np.linalg.solve(transform, m @ transform), transform
+
+
+def bellman_step(a, b, m, r, gamma, p):
+    """One value iteration: (P, K) that minimise x'Mx + u'Ru + gamma (Ax + Bu)' p (Ax + Bu) over u = -K x (eq:bellmanLQR)."""
+    k = gamma * np.linalg.solve(r + gamma * b.T @ p @ b, b.T @ p @ a)
+    closed = a - b @ k
+    return m + k.T @ r @ k + gamma * closed.T @ p @ closed, k
+
+
+def discounted_lqr(a, b, m, r, gamma=1.0):
+    """P and K of min sum gamma^t (x'Mx + u'Ru), u = -K x: the solution of the discounted Riccati equation of section app:lqr.
+
+    It is the undiscounted one of sqrt(gamma) A, sqrt(gamma) B. The closed loop A - B K need only be stable when multiplied by
+    sqrt(gamma): as gamma goes to 0, so does K.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    p = solve_discrete_are(np.sqrt(gamma) * a, np.sqrt(gamma) * b, m, r)
+    return p, bellman_step(a, b, m, r, gamma, p)[1]
+
+
+class Linear:
+    """The plant with matrix A (n, n), B = I, and the names of a plant module (see envs/__init__.py)."""
+
+    ENV_ID, EPISODE_STEPS, DT, TIME_UNIT = "RLMPC/Linear-v0", STEPS, 1.0, "steps"
+    ANGLES, PSI_NAMES, PSI_NOMINAL, MODEL_SUBSTEPS = [], (), np.zeros(0), 1
+    SCENARIOS = {name: np.zeros((1, 0)) for name in ("nominal", "mpc", "robust")}
+    EVAL_PSI = np.zeros((1, 0))
+    REWARD_SIGMA2, REWARD_TOLERANCE = 0.25, 0.1  # squared norm of the state; half-width of the 0/1 reward in every state
+    MPC_SIGMA2 = 0.5  # exp(-l) of eq:jensen
+    # what sac_her_branching.py trains with: over 90,000 parameters per network at n = 32
+    TRAINING = {"hidden": (256, 256), "total_timesteps": 500_000, "num_envs": 64, "gamma": 0.9, "learning_starts": 10_000,
+                "alpha_init": 0.005}  # fmt: skip
+
+    def __init__(self, a, transform=None):
+        n = len(a)
+        one = np.ones(n)
+        self.A, self.B, self.transform = a, np.eye(n), np.eye(n) if transform is None else transform
+        self.STATE_NAMES, self.STATE_UNITS = tuple(f"x_{i + 1}" for i in range(n)), ("-",) * n
+        self.ACTION_NAMES, self.ACTION_UNITS = tuple(f"u_{i + 1}" for i in range(n)), ("-",) * n
+        self.X_LOW, self.X_HIGH = -STATE_BOUND * one, STATE_BOUND * one
+        self.INIT_LOW, self.INIT_HIGH = self.U_LOW, self.U_HIGH = -one, one
+        self.START, self.START_NOISE = 0 * one, one
+        powers, free, forced = np.eye(n), [], np.zeros(n)
+        for _ in range(STEPS + 1):  # |A^t x_0| + sum_k |A^k u|
+            free.append(np.abs(powers).sum(axis=1) + forced)
+            forced, powers = forced + np.abs(powers).sum(axis=1), self.A @ powers
+        self.OBS_HIGH = 1.01 * np.max(free, axis=0)
+        self.OBS_LOW = -self.OBS_HIGH
+        self.BENCHMARK = {"horizon": 10, "slack_price": np.ones((2, n)), "change_weight": np.zeros(n)}
+        self.GOAL_INDEX, self.EVAL_GOAL = list(range(n)), np.zeros(n)
+        # 1,000 goals from the origin to the box, uniform in a box whose half-width is uniform in [0, 1]. The origin alone would be a goal that
+        # the critic recognises and, since it is missed at first, learns to be worth nothing
+        rng = np.random.default_rng(0)
+        self.TRAIN_GOALS = rng.uniform(0, 1, size=(1000, 1)) * rng.uniform(-1, 1, size=(1000, n))
+        self.GOAL_LOW, self.GOAL_HIGH = -one, one
+        held = 1 / np.abs(np.eye(n) - a).sum(axis=1)  # a goal is held by u = (I - A) g
+        self.GOAL_REACHABLE = -held.min() * one, held.min() * one
+        self.ERROR_SCALE = one
+        self.lqr = cache(self._lqr)
+
+    def next_state(self, x, u, psi=None, xp=np):
+        """A x + B u, components along the first axis: x (n, ...), u (n, ...); xp is numpy, torch or casadi."""
+        return xp.asarray(self.A) @ x + u if xp is not np and not hasattr(xp, "vertcat") else self.A @ x + u
+
+    def step(self, x, u, psi=None, substeps=1):
+        """State one sampling time later. Batched over the leading axes: x (..., n), u (..., n) -> (..., n)."""
+        return np.asarray(x, dtype=np.float64) @ self.A.T + np.asarray(u, dtype=np.float64)
+
+    def _lqr(self, gamma=1.0):
+        """P and K, (n, n) each, of the discounted regulator with M = R = I; `lqr` remembers them."""
+        one = np.eye(len(self.A))
+        return discounted_lqr(self.A, self.B, one, one, gamma)
+
+    def held_action(self, goal):
+        """The action that holds a goal, (I - A) g: the linear-quadratic costs count deviations from it."""
+        return goal - self.A @ goal
+
+    def lq_cost(self, x, u, goal):
+        """Stage cost l = |x - g|^2 + |u - (I - A) g|^2 of eq:nominalMPCobj, CasADi."""
+        dx, du = x - goal, u - self.held_action(goal)
+        return dx.T @ dx + du.T @ du
+
+    def lq_value(self, x, goal, gamma=1.0):
+        """Its value V = (x - g)' P (x - g), CasADi."""
+        dx = x - goal
+        return dx.T @ self.lqr(gamma)[0] @ dx
+
+    def feedback(self, x, goal, gamma=1.0):
+        """The regulator's action without limits, u = -K (x - g) + (I - A) g, numpy or CasADi, (n,) or (n, 1)."""
+        return self.held_action(goal) - self.lqr(gamma)[1] @ (x - goal)
+
+    def baseline(self, x, goal):
+        """The regulator's action within the limits, for the controllers' first guesses, components along the first axis."""
+        return np.clip(self.feedback(x, goal).T, self.U_LOW, self.U_HIGH).T
+
+    def goal_error(self, achieved, goal, xp=np):
+        """Elementwise error whose squared norm enters the Gaussian reward."""
+        return achieved - goal
+
+    def percentage_error(self, achieved, goal):
+        """Root mean square over the states, in percent of the half-width of the initial box, (..., n) -> (...)."""
+        return 100 * np.sqrt(np.mean((achieved - goal) ** 2, axis=-1))
+
+
+@cache
+def make(dim=2, system=0):
+    """The plant of dimension `dim` whose matrix is drawn from the seed `system`. Raises ValueError for a size that is not one."""
+    if not (1 <= dim <= 512 and 0 <= system <= 10**9):
+        raise ValueError(f"--dim is {dim} and --system {system}; they must lie in 1 to 512 and 0 to 1000000000")
+    return Linear(*random_matrix(dim, np.random.default_rng([dim, system])))

@@ -1,0 +1,48 @@
+"""What experiments with many independent parts share: every finished cell is kept as a CSV of its own, so that a second call continues."""
+
+import csv
+import hashlib
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from tqdm import tqdm
+
+
+def read(path):
+    """The rows of a table, as dictionaries of strings."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(rows, path):
+    """Rows of equal keys as a table; a killed process leaves no half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}")
+    with open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    temporary.replace(path)
+
+
+def _fill(function, cell, path):
+    write(function(cell), path)
+
+
+def collect(function, cells, jobs, folder, inputs):
+    """The rows `function(cell)` of all cells, in order, over `jobs` processes.
+
+    Cells are told apart by their repr; `inputs` are the files that the results depend on (a change makes every cell new).
+    """
+    version = hashlib.sha256(b"".join(Path(file).read_bytes() for file in inputs)).digest()
+    paths = [folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells]
+    with ProcessPoolExecutor(jobs) as pool:
+        futures = [pool.submit(_fill, function, cell, path) for cell, path in zip(cells, paths) if not path.exists()]
+        try:
+            for future in tqdm(as_completed(futures), initial=len(cells) - len(futures), total=len(cells), unit="cell", disable=None):
+                future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [row for path in paths for row in read(path)]
