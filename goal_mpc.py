@@ -99,7 +99,8 @@ class Args:
     guide_horizon: int = 0
     """horizon of a controller whose simulated closed loop is the first guess; 0: the start state held. Helps from N = 100 on"""
     compile: bool = True
-    """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc)"""
+    """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc); linear plants are never compiled, since
+    matrix products gain nothing"""
     animate: bool = False
     """write episode.gif of the first episode, with the predicted motion drawn faintly"""
     out: Path | None = None
@@ -544,7 +545,8 @@ def build_controller(args):
                        goal=plant.EVAL_GOAL, gamma=args.gamma, control_horizon=args.control_horizon,
                        robust_horizon=args.robust_horizon, discretization=args.discretization,
                        slack_price=np.inf if args.constraints == "hard" else args.slack_weight, slack_price_l2=args.slack_weight_l2,
-                       change_weight=change_weight, solver=args.solver, guide=guide, compile=args.compile)  # fmt: skip
+                       change_weight=change_weight, solver=args.solver, guide=guide,
+                       compile=args.compile and not hasattr(plant, "next_state"))  # fmt: skip
 
 
 # Closed loop
@@ -636,6 +638,8 @@ def figure(plant, x, u, goals, path):
     low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
     titles = [f"{n} [{v}]" for n, v in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
     shown = [i for i in range(len(low)) if i in plant.GOAL_INDEX or np.isfinite(low[i])]
+    if len(shown) > 12:  # of a large plant, the first few
+        shown = [i for i in shown if i < 4 or n_x <= i < n_x + 2]
     values = np.hstack([x, np.vstack([u, u[-1:]])])
     fig, axes = plt.subplots(len(shown), 1, figsize=(8, 0.7 + 1.5 * len(shown)), sharex=True, layout="constrained", squeeze=False)
     for ax, i in zip(axes.ravel(), shown):

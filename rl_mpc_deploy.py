@@ -592,21 +592,26 @@ class ActorController:
 
 
 class GreedyController(ActorController):
-    """Horizon 0: argmax over u in U of Q(x, u, goal), by L-BFGS-B from the actor's action and the best point of a grid."""
+    """Horizon 0: argmax over u in U of Q(x, u, goal), by L-BFGS-B from the actor's action and the best of some points of U.
+
+    The points are a grid for one or two actions, random for more.
+    """
 
     def __init__(self, plant, actor, Q, goal, points=9):
         super().__init__(plant, actor, goal)
         x, v = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("v", len(plant.U_LOW))  # v: action scaled to [0, 1]
         q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), self.goal)
         self.negative_q = ca.Function("negative_q", [v, x], [-q, -ca.gradient(q, v)])
-        axes = np.meshgrid(*[np.linspace(0, 1, points)] * len(plant.U_LOW))
-        self.grid = np.stack([a.ravel() for a in axes])  # (n_u, points^n_u)
+        if v.numel() <= 2:
+            self.points = np.stack([a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, points)] * v.numel())])  # (n_u, points^n_u)
+        else:
+            self.points = np.random.default_rng(0).uniform(size=(v.numel(), points**2))
 
     def make_step(self, x0):
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         span = self.plant.U_HIGH - self.plant.U_LOW
-        on_grid = np.array(self.negative_q(self.grid, x0)[0]).ravel()
-        starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.grid[:, on_grid.argmin()]]
+        at_points = np.array(self.negative_q(self.points, x0)[0]).ravel()
+        starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.points[:, at_points.argmin()]]
 
         def objective(v):
             value, gradient = self.negative_q(v, x0)
@@ -780,9 +785,12 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
 
     low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
     titles = [f"{n} [{u}]" for n, u in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
-    fig, axes = plt.subplots(-(-len(low) // 3), 3, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
+    shown = list(range(len(low)))
+    if len(shown) > 12:  # of a large plant, the first few
+        shown = [i for i in shown if i < 4 or len(plant.X_LOW) <= i < len(plant.X_LOW) + 2]
+    fig, axes = plt.subplots(-(-len(shown) // 3), 3, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
     hours, names = np.arange(args.steps + 1) * plant.DT, {row["controller"]: label(row) for row in rows}
-    for i, (ax, title) in enumerate(zip(axes.ravel(), titles)):
+    for i, ax in zip(shown, axes.ravel()):
         for name, (x, u) in paths.items():
             values = np.hstack([x[episode], np.vstack([u[episode], u[episode][-1:]])])[:, i]
             (colour, dashes), style = STYLES[name], "default" if i < len(plant.X_LOW) else "steps-post"
@@ -792,7 +800,7 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
                 ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
         if i in plant.GOAL_INDEX:
             ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
-        ax.set_title(title, fontsize=10)
+        ax.set_title(titles[i], fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
     handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}

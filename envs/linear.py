@@ -62,7 +62,7 @@ class Linear:
     MPC_SIGMA2 = 0.5  # exp(-l) of eq:jensen
     # what sac_her_branching.py trains with: over 90,000 parameters per network at n = 32
     TRAINING = {"hidden": (256, 256), "total_timesteps": 500_000, "num_envs": 64, "gamma": 0.9, "learning_starts": 10_000,
-                "alpha_init": 0.005}  # fmt: skip
+                "steps_per_update": 16, "alpha_init": 0.005}  # fmt: skip
 
     def __init__(self, a, transform=None):
         n = len(a)
@@ -81,8 +81,8 @@ class Linear:
         self.OBS_LOW = -self.OBS_HIGH
         self.BENCHMARK = {"horizon": 10, "slack_price": np.ones((2, n)), "change_weight": np.zeros(n)}
         self.GOAL_INDEX, self.EVAL_GOAL = list(range(n)), np.zeros(n)
-        # 1,000 goals from the origin to the box, uniform in a box whose half-width is uniform in [0, 1]. The origin alone would be a goal that
-        # the critic recognises and, since it is missed at first, learns to be worth nothing
+        # 1,000 goals, each uniform in a box whose half-width is uniform in [0, 1]. The origin alone would be a goal that the critic
+        # recognises and, since it is missed at first, learns to be worth nothing
         rng = np.random.default_rng(0)
         self.TRAIN_GOALS = rng.uniform(0, 1, size=(1000, 1)) * rng.uniform(-1, 1, size=(1000, n))
         self.GOAL_LOW, self.GOAL_HIGH = -one, one
