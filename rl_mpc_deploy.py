@@ -90,7 +90,8 @@ class Args:
     controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
-    """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc)"""
+    """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc); linear plants are
+    never compiled, since matrix products gain nothing"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__rl_mpc_deploy__{seed}__{time}"""
 
@@ -183,27 +184,131 @@ def load_critic(path, env, combine="first"):
 # CasADi export
 
 
-def export(critic):
-    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64."""
+def layers(critic):
+    """(W, b) of every layer, b a column: of the actor, whose last gives the mean alone, and of the twin critics."""
+    n_u = critic.network["n_u"]
+    actor = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()[:, None]) for layer in [*critic.actor.layers, critic.actor.head]]
+    actor[-1] = tuple(v[:n_u] for v in actor[-1])
+    twins = [
+        [(w[j].T.detach().numpy(), b[j].T.detach().numpy()) for w, b in zip(critic.critic.weight, critic.critic.bias)] for j in range(2)
+    ]
+    return actor, twins
 
-    def mlp(layers, h):
-        for i, (w, b) in enumerate(layers):
-            h = w @ h + b
-            if i < len(layers) - 1:
-                h = h * (1 + ca.tanh(h / 2)) / 2  # SiLU; exp(-h) would overflow in its derivatives
-        return h
 
-    s, n_u = critic.scaling, critic.network["n_u"]
-    x, goal, u = ca.MX.sym("x", len(s["x_center"])), ca.MX.sym("goal", len(s["goal_center"])), ca.MX.sym("u", n_u)
-    z = critic.features(x, goal, ca)
-    actor_layers = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in [*critic.actor.layers, critic.actor.head]]
-    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor_layers, z)[:n_u]) * s["u_scale"] + s["u_center"]])
+def mlp(layers, h, J, xp):
+    """Output of an MLP with SiLU, its Jacobian given that of h, and what `curvature` needs; xp numpy or casadi, h (n, 1), J (n, n_x)."""
+    tape = []
+    for w, b in layers[:-1]:
+        a, J = w @ h + b, w @ J
+        p = (1 + xp.tanh(a / 2)) / 2  # SiLU is a p; exp(-a) would overflow in its derivatives
+        first, second = p * (1 + a * (1 - p)), p * (1 - p) * (2 + a * (1 - 2 * p))
+        tape.append((w, J, first, second))
+        h, J = a * p, first * J
+    w, b = layers[-1]
+    return w @ h + b, w @ J, tape
+
+
+def curvature(tape, adjoint):
+    """Adjoint of the MLP's input and its share of the Hessian, from the adjoint of its last hidden layer."""
+    hessian = 0
+    for w, J, first, second in reversed(tape):
+        hessian += J.T @ (adjoint * second * J)
+        adjoint = w.T @ (adjoint * first)
+    return adjoint, hessian
+
+
+def second_order(critic, z, J, xp):
+    """V at the features z (n_in, 1), its gradient with respect to them, and its Hessian along J (n_in, n_x), xp numpy or casadi.
+
+    The Hessian of a chain of linear maps and elementwise functions f is the sum over all of their inputs a of
+    (adjoint of f(a)) f''(a) (da/dx)(da/dx)'. Written so it takes a few matrix products, where automatic differentiation would send n_x
+    directions through the networks one by one: at n_x = 32 that is the difference between milliseconds and tens of them.
+    """
+    stack, (actor, twins), results = ca.vertcat if xp is ca else lambda *parts: np.vstack(parts), layers(critic), []
+    mean, J_mean, actor_tape = mlp(actor, z, J, xp)
+    action = xp.tanh(mean)
+    slope = 1 - action**2
+    for twin in twins[: 1 if critic.combine == "first" else 2]:
+        q, _, tape = mlp(twin, stack(z, action), stack(J, slope * J_mean), xp)
+        adjoint, hessian = curvature(tape, twin[-1][0].T)
+        d_z, d_action = adjoint[: z.shape[0], :], adjoint[z.shape[0] :, :]
+        through_actor, more = curvature(actor_tape, actor[-1][0].T @ (d_action * slope))
+        results.append((q, d_z + through_actor, hessian + more + J_mean.T @ (d_action * -2 * action * slope * J_mean)))
+    if len(results) == 1:
+        return results[0]
+    share = 0.5 if critic.combine == "mean" else results[0][0] <= results[1][0]
+    return tuple(share * a + (1 - share) * b for a, b in zip(*results))
+
+
+class Expansion(ca.Callback):
+    """CasADi function (x, goal) -> V, its gradient (n_x,), its Hessian (n_x, n_x), physical units, that computes in numpy."""
+
+    def __init__(self, critic):
+        ca.Callback.__init__(self)
+        self.critic, self.n_x, self.n_goal = critic, len(critic.scaling["x_center"]), len(critic.scaling["goal_center"])
+        x, goal, adjoint = (ca.MX.sym(name, n) for name, n in (("x", self.n_x), ("goal", self.n_goal), ("adjoint", critic.network["n_in"])))
+        z = critic.features(x, goal, ca)
+        self.features = ca.Function("features", [x, goal], [z, ca.jacobian(z, x)])
+        self.bend = ca.Function("bend", [x, goal, adjoint], [ca.hessian(ca.dot(adjoint, z), x)[0]])  # of the features: zero without angles
+        self.construct("expansion")
+
+    def get_n_in(self):
+        return 2
+
+    def get_n_out(self):
+        return 3
+
+    def get_sparsity_in(self, i):
+        return ca.Sparsity.dense((self.n_x, self.n_goal)[i])
+
+    def get_sparsity_out(self, i):
+        return ca.Sparsity.dense(*((1, 1), (self.n_x, 1), (self.n_x, self.n_x))[i])
+
+    def eval(self, arguments):
+        x, goal = arguments
+        z, J = (np.array(value) for value in self.features(x, goal))
+        v, d_z, hessian = second_order(self.critic, z, J, np)
+        return v, J.T @ d_z, hessian + np.array(self.bend(x, goal, d_z))
+
+    def symbolic(self, x, goal):
+        """The same in CasADi's own operations, which can be compiled."""
+        z, J = self.features(x, goal)
+        v, d_z, hessian = second_order(self.critic, z, J, ca)
+        return v, J.T @ d_z, hessian + self.bend(x, goal, d_z)
+
+
+def export(critic, numpy_hessian=False):
+    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64.
+
+    V has the derivatives of `second_order` with respect to x and none with respect to the goal. numpy_hessian: faster for large networks,
+    but cannot be compiled.
+    """
+    s, n_u, n_x, n_goal = critic.scaling, critic.network["n_u"], len(critic.scaling["x_center"]), len(critic.scaling["goal_center"])
+    x, goal, u = ca.MX.sym("x", n_x), ca.MX.sym("goal", n_goal), ca.MX.sym("u", n_u)
+    (actor, twins), z = layers(critic), critic.features(x, goal, ca)
+    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor, z, ca.MX(z.numel(), 1), ca)[0]) * s["u_scale"] + s["u_center"]])
     za = ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])
-    critic_layers = [(w.detach().numpy(), b.detach().numpy()) for w, b in zip(critic.critic.weight, critic.critic.bias)]
-    q = [mlp([(w[j].T, b[j, 0]) for w, b in critic_layers], za) for j in range(2)]
-    combined = {"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]
-    Q = ca.Function("Q", [x, u, goal], [combined])
-    V = ca.Function("V", [x, goal], [Q(x, mu(x, goal), goal)], ["x", "goal"], ["V"])
+    q = [mlp(twin, za, ca.MX(za.numel(), 1), ca)[0] for twin in twins]
+    Q = ca.Function("Q", [x, u, goal], [{"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]])
+
+    critic.expansion = Expansion(critic)  # CasADi does not keep a Python object alive
+    v, gradient, hessian = critic.expansion.symbolic(x, goal)
+    if numpy_hessian:
+        hessian = critic.expansion(x, goal)[2]
+    state = ca.MX.sym("state", n_x + n_goal)
+    parts, blank = ca.vertsplit(state, [0, n_x, n_x + n_goal]), ca.MX(1, n_x + n_goal)
+    named = {"never_inline": True, "enable_forward": False, "enable_reverse": False}
+
+    def at(name, expression):
+        return ca.Function(name, [x, goal], [expression], {"never_inline": True})(*parts)
+
+    jac = ca.horzcat(at("value_slope", gradient).T, ca.MX(1, n_goal))
+    hess = ca.diagcat(at("value_hessian", hessian), ca.MX(n_goal, n_goal))
+    jac_jac = ca.Function("jac_jac_value", [state, ca.MX(1, 1), blank], [hess, blank.T],
+                          ["state", "out_v", "out_jac_v_state"], ["jac_jac_v_state_state", "jac_jac_v_state_out_v"], named)  # fmt: skip
+    jac = ca.Function("jac_value", [state, ca.MX(1, 1)], [jac], ["state", "out_v"], ["jac_v_state"], named | {"custom_jacobian": jac_jac})
+    value = ca.Function("value", [state], [at("value_only", v)], ["state"], ["v"], named | {"custom_jacobian": jac})
+    V = ca.Function("V", [x, goal], [value(ca.vertcat(x, goal))], ["x", "goal"], ["V"])
     return mu, Q, V
 
 
@@ -234,37 +339,24 @@ class TaylorValue:
     """
 
     def __init__(self, critic, goal):
-        self.n, self.goal = len(critic.scaling["x_center"]), torch.tensor(goal)
-        self.center, self.scale = (torch.tensor(critic.scaling[f"x_{k}"]) for k in ("center", "scale"))
-
-        def value(z):  # of one state in units of the box
-            return critic.value((z * self.scale + self.center)[None], self.goal[None])[0]
-
-        def slope(z):
-            v = value(z)
-            return torch.func.grad(value)(z), v
-
-        def expansion(z):
-            hessian, (gradient, v) = torch.func.jacrev(lambda y: (lambda g: (g[0], g))(slope(y)), has_aux=True)(z)
-            return hessian, gradient, v
-
-        self.derivatives = torch.func.vmap(expansion)
-        # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
+        self.expansion, self.goal, self.scale = Expansion(critic), goal, critic.scaling["x_scale"]
+        self.n = len(self.scale)
         x, theta = ca.MX.sym("x", self.n), ca.MX.sym("theta", 1 + 2 * self.n + self.n**2)
-        z0, v0, slope0, curvature = ca.vertsplit(theta, np.cumsum([0, self.n, 1, self.n, self.n**2]).tolist())
-        dz = (x - self.center.numpy()) / self.scale.numpy() - z0
-        self.cost = ca.Function(
-            "taylor", [x, theta], [v0 + ca.dot(slope0, dz) + ca.bilin(ca.reshape(curvature, self.n, self.n), dz, dz) / 2]
-        )
+        # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
+        center, v, slope, hessian = ca.vertsplit(theta, np.cumsum([0, self.n, 1, self.n, self.n**2]).tolist())
+        dx = (x - center) / self.scale
+        cost = v + ca.dot(slope, dx) + ca.bilin(ca.reshape(hessian, self.n, self.n), dx, dx) / 2
+        self.cost = ca.Function("taylor", [x, theta], [cost])
 
     def parameters(self, x):
         """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points)."""
-        z = (torch.tensor(x.T) - self.center) / self.scale
-        with torch.no_grad():
-            hessian, gradient, value = self.derivatives(z)
-            eigenvalues, vectors = torch.linalg.eigh(-hessian)
-            curvature = vectors * eigenvalues.clamp(min=0)[:, None] @ vectors.mT
-        return torch.cat([z, -value[:, None], -gradient, curvature.flatten(1)], dim=1).T.numpy()
+        columns = []
+        for point in x.T:
+            v, gradient, hessian = (np.array(value) for value in self.expansion.eval((point, self.goal)))
+            eigenvalues, vectors = np.linalg.eigh(-hessian * np.outer(self.scale, self.scale))
+            projected = vectors * np.maximum(eigenvalues, 0) @ vectors.T
+            columns.append(np.concatenate([point, -v.ravel(), -gradient.ravel() * self.scale, projected.ravel()]))
+        return np.stack(columns, axis=1)
 
 
 # Scenario MPC
@@ -442,6 +534,7 @@ class ScenarioMPC:
         self.u_before = np.zeros(self.n_u)  # the reference's convention for the input-change penalty
         self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
         self.plan_left = 0  # actions that it still holds
+        self.last, self.x_before = None, None  # the solution of the previous step, if it succeeded, and its state
         self.last_w = None
         self.stats = {}
 
@@ -488,7 +581,7 @@ class ScenarioMPC:
     def set_initial_guess(self, x0):
         """Forget the previous plan: the next solve starts from `cold_guess`."""
         envs.checked_state(self.plant, x0)
-        self.plan, self.plan_left = None, 0
+        self.plan, self.plan_left, self.last = None, 0, None
 
     def _parameters(self, x0, price):
         return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel(), self.theta.ravel("F")])
@@ -534,20 +627,24 @@ class ScenarioMPC:
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
-        cold, start, multipliers = self.cold_guess(x0), "cold", ()
-        if self.plan is not None:
-            w, *multipliers = self.plan
-            shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
-            if self.actor is None or self._cost(x0, shifted) <= self._cost(x0, cold):
-                start = "warm"
-        self._expand(shifted if start == "warm" else cold)
-        solution = self._solve(start, x0, self.slack_price, *((shifted, *multipliers) if start == "warm" else (cold,)))
+        start, guess = "warm", self.last
+        if self.last is None or (np.abs(x0 - self.x_before) > 1e-3 * self.x_scale).any():  # else the last plan itself is the best guess
+            start, guess = "cold", (self.cold_guess(x0),)
+            if self.plan is not None:
+                w, *multipliers = self.plan
+                shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
+                if self.actor is None or self._cost(x0, shifted) <= self._cost(x0, guess[0]):
+                    start, guess = "warm", (shifted, *multipliers)
+        self._expand(guess[0])
+        solution = self._solve(start, x0, self.slack_price, *guess)
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
+            cold = self.cold_guess(x0)
             if self.relaxed_price is not None:
                 solution = self._solve("cold", x0, np.full((2, self.n_x), self.relaxed_price), cold)
             else:
                 solution = self._solve("cold", x0, self.slack_price, cold if start == "warm" else self.hold_guess(x0))
+        self.last, self.x_before = solution, x0
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
         elif self.plan_left > 0:
@@ -627,7 +724,9 @@ def build_controller(name, args):
     """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc" or "rl_mpc"."""
     greedy = name == "rl_mpc" and args.horizon == 0
     critic = load_critic(critic_path(args), args.env, "min" if greedy else args.combine)
-    plant, (mu, Q, V) = critic.plant, export(critic)
+    plant = critic.plant
+    compile = args.compile and not hasattr(plant, "next_state")
+    mu, Q, V = export(critic, numpy_hessian=not compile)
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
     if name == "actor":
         return ActorController(plant, mu, goal)
@@ -644,13 +743,13 @@ def build_controller(name, args):
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
             learned = dict(actor=mu, taylor=TaylorValue(critic, goal), expand_at=point)
-        return ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=args.compile,
+        return ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
                            slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
-                       compile=args.compile)  # fmt: skip
+                       compile=compile)  # fmt: skip
 
 
 def settled_state(plant, mu, goal, steps=1000):
