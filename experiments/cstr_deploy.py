@@ -3,10 +3,11 @@ serves RL+MPC best.
 
     python experiments/cstr_deploy.py --jobs 2      # 50 draws, half an hour; continues, variant by variant, where it stopped
     python experiments/cstr_deploy.py --study value --episodes 10
+    python experiments/cstr_deploy.py --study expansion
     python experiments/cstr_deploy.py --plot-only   # redraw from the committed CSV
 
-Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png; the second
-study writes cstr_value.csv and cstr_value.png.
+Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png; the other
+studies write cstr_value and cstr_expansion.
 """
 
 import csv
@@ -44,13 +45,19 @@ STUDIES = {  # name: {label: settings of rl_mpc_deploy.py}
         "mean of both critics": dict(controllers=("rl_mpc",), combine="mean"),
         "no entropy in the target": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_no_entropy.pt"),
     },
+    "expansion": {
+        "exact value": dict(controllers=("rl_mpc",)),
+        "taylor": dict(controllers=("rl_mpc",), value="taylor"),
+        "taylor-local": dict(controllers=("rl_mpc",), value="taylor-local"),
+    },
 }
 
 
 @dataclass
 class Args:
-    study: Literal["deploy", "value"] = "deploy"
-    """deploy: the controllers against each other; value: RL+MPC with each way to read a value out of a checkpoint"""
+    study: Literal["deploy", "value", "expansion"] = "deploy"
+    """deploy: the controllers against each other; value: RL+MPC with each way to read a value out of a checkpoint; expansion: with that
+    value and its second-order expansions"""
     episodes: int = 50
     """paired draws"""
     seed: int = 0

@@ -1,12 +1,13 @@
 """Figure `norm_profile`: the learned value in goal-conditioned MPC on ten random linear systems with 32 states, and its fast variants.
 
-    python experiments/linear_value_mpc.py --study train --jobs 2    # an hour: one agent per system; continues where it stopped
-    python experiments/linear_value_mpc.py                           # the closed loops, one process, so that solve times mean something
+    python experiments/linear_value_mpc.py --study train --jobs 2    # forty minutes: an agent per system; continues where it stopped
+    python experiments/linear_value_mpc.py                           # the closed loops; one process, so that solve times mean something
     python experiments/linear_value_mpc.py --study distance          # how far from the goal the fast variants stay valid
     python experiments/linear_value_mpc.py --study scaling           # solve time against n and against the horizon
     python experiments/linear_value_mpc.py --study profile --plot-only
 
-The agents are those of `python sac_her_branching.py --env linear --dim 32 --system I --seed I`. Every controller has the stage cost
+The agents are those of `python sac_her_branching.py --env linear --dim 32 --system I --seed I`; the scaling study has one more for each
+smaller n, of 100,000 transitions. Every controller has the stage cost
 -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an
 expansion of -V about the goal (taylor) or about where the previous plan ends (taylor-local). Beside them the goal-conditioned MPC of
 linear_scalability.py, whose costs contain the input and whose terminal cost is the regulator's.
@@ -21,7 +22,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -51,6 +52,8 @@ CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None
     "RL+MPC, taylor": ("#0072B2", (0, (5, 1)), dict(controllers=("rl_mpc",), value="taylor")),
     "RL+MPC, taylor-local": ("#CC79A7", (0, (3, 1, 1, 1)), dict(controllers=("rl_mpc",), value="taylor-local")),
 }
+SCALING_DIMENSIONS, SCALING_HORIZONS = (2, 4, 8, 16), (2, 5, 10, 20, 40)  # beside --dim
+DISTANCE_HORIZONS, DISTANCES = (1, 2, 5, 10), (0.1, 0.3, 1.0, 1.5)
 MEASURES = ("steps_not_near", "l2_error", "constraint_violation")
 
 
@@ -73,7 +76,7 @@ class Args:
     jobs: int = 1
     """processes; more than one per core disturbs the solve times"""
     quick: bool = False
-    """2 systems with 2 states, hardly trained, 2 starts of 5 steps: a smoke test"""
+    """2 systems with 3 states, hardly trained, 2 starts of 5 steps: a smoke test"""
     plot_only: bool = False
     """redraw the figure from the CSV"""
     runs: Path = Path("runs/linear_value_mpc")
@@ -108,6 +111,8 @@ def train(args, dim, system):
         else:
             command += ["--env", "linear", "--dim", str(dim), "--system", str(system), "--seed", str(system), "--out", str(parent)]
             command += ["--save-every", "100000"]
+            if dim != args.dim:
+                command += ["--total-timesteps", "100000"]
             if args.quick:
                 command += ["--total-timesteps", "2000", "--learning-starts", "500", "--eval-every", "1000", "--hidden", "16", "16"]
         tick = time.perf_counter()
@@ -126,10 +131,13 @@ def train(args, dim, system):
 
 
 def train_all(args):
-    systems = range(args.seed, args.seed + args.systems)
+    agents = [(args.dim, system) for system in range(args.seed, args.seed + args.systems)] + [
+        (n, args.seed) for n in scaling_dimensions(args)[:-1]
+    ]
     with ThreadPoolExecutor(args.jobs) as pool:
-        rows = list(tqdm(pool.map(lambda system: train(args, args.dim, system), systems), total=len(systems), unit="agent", disable=None))
+        rows = list(tqdm(pool.map(lambda agent: train(args, *agent), agents), total=len(agents), unit="agent", disable=None))
     cells.write(rows, args.out / "results/linear_training.csv")
+    rows = rows[: args.systems]
     print("system  updates  seconds  error %, median  75th percentile  (root mean square of the state over steps 26 to 50)")
     for row in rows:
         print(
@@ -205,16 +213,15 @@ def without(row, *keys):
     return {k: v for k, v in row.items() if k not in keys}
 
 
-def collect(args, labels, horizons, scales, folder="loops"):
-    starts, steps, dim, systems = (2, 5, 2, 2) if args.quick else (args.starts, args.steps, args.dim, args.systems)
+def collect(args, labels, horizons, scales):
     work = [
-        (label, dim, system, horizon, scales, starts, steps, str(checkpoint(args, dim, system)))
+        (label, args.dim, system, horizon, scales, args.starts, args.steps, str(checkpoint(args, args.dim, system)))
         for horizon in horizons
         for label in labels
         if not (label == "RL (actor alone)" and horizon != horizons[0])
-        for system in range(args.seed, args.seed + systems)
+        for system in range(args.seed, args.seed + args.systems)
     ]
-    return cells.collect(run_cell, work, args.jobs, args.runs / folder, inputs())
+    return cells.collect(run_cell, work, args.jobs, args.runs / args.study, inputs())
 
 
 def profile(args):
@@ -230,6 +237,11 @@ def profile(args):
             curve |= dict(zip(("ms_low", "ms_median", "ms_high"), np.quantile(times[:, late], [0.025, 0.5, 0.95])))
             curves.append({"controller": label, "step": t} | {k: round(float(v), 6) for k, v in curve.items()})
     cells.write(curves, args.out / "results/linear_profile.csv")
+
+
+def paired(rows, label):
+    """Steps not near the origin of a controller, in the order of systems and starts."""
+    return np.array([float(row["steps_not_near"]) for row in rows if row["controller"] == label])
 
 
 def plot_profile(args):
@@ -255,6 +267,10 @@ def plot_profile(args):
     for label in list(CONTROLLERS)[3:]:
         print(f"{label}: solve time over that without a value, median {baseline[label]['solve_ms_median'] / plain['solve_ms_median']:.2f}, "
               f"first five steps {baseline[label]['solve_ms_transient'] / plain['solve_ms_transient']:.2f}")  # fmt: skip
+    actor = paired(rows, "RL (actor alone)")
+    for label in list(CONTROLLERS)[1:]:
+        gain = actor - paired(rows, label)
+        print(f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}")
     axes[0].set(ylabel="|x|", yscale="log", xlim=(0, 30))
     axes[1].set(ylabel="solve time [ms]", yscale="log", xlabel="step")
     axes[0].set_title(f"{len(mine['l2_error'])} systems and starts; lines: medians, bands: 2.5 to 95 percentile", fontsize=10)
@@ -273,14 +289,12 @@ def save(fig, path):
 # How far from the goal
 
 
-HORIZONS, SCALES = (1, 2, 5, 10), (0.1, 0.3, 1.0, 1.5)
-
-
 def distance(args):
     """The learned value and its expansions from starts that are scaled towards or away from the goal, at several horizons."""
-    horizons, scales = ((1, 2), (0.1, 1.0)) if args.quick else (HORIZONS, SCALES)
+    args = replace(args, starts=min(args.starts, 2), steps=min(args.steps, 20))
+    horizons, scales = ((1, 2), (0.1, 1.0)) if args.quick else (DISTANCE_HORIZONS, DISTANCES)
     labels = [label for label in CONTROLLERS if "regulator" not in label]
-    rows = collect(args, labels, horizons, scales, "distance")
+    rows = collect(args, labels, horizons, scales)
     cells.write([without(row, "norms", "times") for row in rows], args.out / "results/linear_distance.csv")
 
 
@@ -309,12 +323,14 @@ def plot_distance(args):
 # Scaling
 
 
+def scaling_dimensions(args):
+    return [n for n in SCALING_DIMENSIONS[: 1 if args.quick else None] if n < args.dim] + [args.dim]
+
+
 def scaling(args):
-    """Solve times of system 0: against n at the horizon, against the horizon at n = dim."""
-    dimensions, horizons, starts, steps = ((2,), (2, 4), 1, 5) if args.quick else ((2, 4, 8, 16, 32), (2, 5, 10, 20, 40), 5, 20)
-    rows = []
-    for n in dimensions:
-        train(args, n, args.seed)
+    """Solve times of one system: against n at the horizon, against the horizon at n = dim."""
+    dimensions, horizons = scaling_dimensions(args), SCALING_HORIZONS[: 2 if args.quick else None]
+    starts, steps, rows = min(args.starts, 5), min(args.steps, 20), []
     for axis, pairs in (("n", [(n, args.horizon) for n in dimensions]), ("horizon", [(dimensions[-1], N) for N in horizons])):
         work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)))
                 for n, N in pairs for label in CONTROLLERS if "actor" not in label]  # fmt: skip
@@ -329,7 +345,7 @@ def plot_scaling(args):
     labels = [label for label in CONTROLLERS if "actor" not in label]
     for ax, axis in zip(axes, ("n", "horizon")):
         values = sorted({int(row[axis]) for row in rows if row["axis"] == axis})
-        print(f"{axis}: median ms per iteration and (mean ms of the first five steps) at {values}")
+        print(f"{axis}: median ms per step and (mean ms of the first five steps) at {values}")
         for label in labels:
             mine = [[row for row in rows if (row["axis"], row["controller"], row[axis]) == (axis, label, str(v))] for v in values]
             early = [np.median([float(row["solve_ms_transient"]) for row in group]) for group in mine]
@@ -347,6 +363,8 @@ def plot_scaling(args):
 
 
 def main(args):
+    if args.quick:
+        args = replace(args, dim=3, systems=2, starts=2, steps=5)
     if args.study == "train":
         return train_all(args)
     if not args.plot_only:

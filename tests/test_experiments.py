@@ -19,8 +19,20 @@ EXPERIMENTS = {
     "dip_equilibria": ["dip_equilibria.csv", "dip_profile.csv"],
 }
 FIGURES = {name: name for name in EXPERIMENTS} | {"dip_equilibria": "dip_profile"}
+LINEAR_TABLES = (
+    "linear_scalability",
+    "linear_sweep",
+    "linear_training",
+    "linear_value_mpc",
+    "linear_profile",
+    "linear_distance",
+    "linear_times",
+)
+LINEAR_FIGURES = {"linear_scalability", "linear_jensen", "linear_sweep", "linear_value_mpc", "linear_distance", "linear_times"}
+LINEAR_STUDIES = [("linear_scalability", "main"), ("linear_scalability", "sweep")]
+LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distance", "scaling")]
 NO_RUNS = {"cstr_profile", "dip_equilibria"}  # too short to be kept in parts
-TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium"}
+TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium", "axis"}
 
 
 def run(name, *arguments):
@@ -29,18 +41,50 @@ def run(name, *arguments):
     assert out.returncode == 0, out.stderr
 
 
+def check_table(table, folder):
+    """The columns of the committed table, and finite numbers in both."""
+    rows = list(csv.DictReader(open(folder / "results" / table)))
+    committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
+    assert rows and list(rows[0]) == list(committed[0])
+    for row in rows + committed:
+        assert all(np.isfinite(float(value)) for key, value in row.items() if key not in TEXT)
+        assert "psi" not in row or len(json.loads(row["psi"])) == 2
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick_run(name, tmp_path):
     keep = ["--runs", tmp_path / "runs"] if name not in NO_RUNS else []
     run(name, "--quick", "--out", tmp_path, *keep)
     assert (tmp_path / "figures" / f"{FIGURES[name]}.png").stat().st_size > 10_000
     for table in EXPERIMENTS[name]:
-        rows = list(csv.DictReader(open(tmp_path / "results" / table)))
-        committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
-        assert rows and list(rows[0]) == list(committed[0])
-        for row in rows + committed:
-            assert all(np.isfinite(float(value)) for key, value in row.items() if key not in TEXT)
-            assert "psi" not in row or len(json.loads(row["psi"])) == 2
+        check_table(table, tmp_path)
+
+
+def test_linear_experiments(tmp_path):
+    """Their studies build on each other; a second call finds everything done."""
+    keep = ["--quick", "--out", tmp_path, "--runs", tmp_path / "runs"]
+    for study in ("main", "sweep"):
+        run("linear_scalability", "--study", study, *keep)
+    for study in ("train", "profile", "distance", "scaling", "train", "profile"):
+        run("linear_value_mpc", "--study", study, *keep)
+    for table in LINEAR_TABLES:
+        check_table(f"{table}.csv", tmp_path)
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == LINEAR_FIGURES
+    agents = list((tmp_path / "runs/agents").glob("*/*/wall_seconds.txt"))
+    assert len(agents) == 3  # the second call trained none again
+
+
+@pytest.mark.parametrize("name, study", LINEAR_STUDIES)
+def test_linear_figures_are_drawn_from_the_committed_tables(name, study, tmp_path):
+    shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
+    run(name, "--study", study, "--plot-only", "--out", tmp_path)
+    assert all(path.stat().st_size > 10_000 for path in (tmp_path / "figures").iterdir())
+
+
+def test_agents_are_needed_before_their_closed_loops(tmp_path):
+    command = [sys.executable, "experiments/linear_value_mpc.py", "--runs", str(tmp_path), "--out", str(tmp_path)]
+    out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert out.returncode == 2 and "--study train" in out.stderr and "Traceback" not in out.stderr
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

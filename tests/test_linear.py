@@ -1,5 +1,7 @@
 """Linear systems: the regulator against scipy and the Bellman equation, LQ-MPC against the regulator, eq:jensen, real clients."""
 
+import csv
+import subprocess
 import sys
 from pathlib import Path
 
@@ -17,7 +19,8 @@ import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import linear
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "experiments"))
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "experiments"))
 import linear_scalability as study
 
 GAMMAS = (0.3, 0.9, 0.99, 1.0)
@@ -268,6 +271,89 @@ def test_training_and_deployment_run_on_it(tmp_path):
         assert all(np.isfinite(row["time_near_goal"]) for row in rows)
 
 
+# Expanded values
+
+
+class QuadraticCritic:
+    """What TaylorValue and the controllers ask of a critic, for V = v0 + b'(x - c) - (x - c)'S(x - c) in CasADi."""
+
+    def __init__(self, S, b, c):
+        self.n = len(c)
+        self.scaling = {"x_scale": np.linspace(0.5, 2, self.n)}
+        x, goal = ca.MX.sym("x", self.n), ca.MX.sym("goal", self.n)
+        self.V = ca.Function("V", [x, goal], [3.0 + ca.dot(b, x - c) - ca.bilin(ca.DM(S), x - c, x - c)])
+        derivatives = [self.V(x, goal), ca.gradient(self.V(x, goal), x), ca.hessian(self.V(x, goal), x)[0]]
+        self.function = ca.Function("expansion", [x, goal], derivatives)
+
+
+def taylor_of(critic, monkeypatch):
+    monkeypatch.setattr(deploy, "Expansion", lambda critic: type("E", (), {"eval": staticmethod(lambda args: critic.function(*args))}))
+    return deploy.TaylorValue(critic, np.zeros(critic.n))
+
+
+def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equal(monkeypatch):
+    plant, rng = linear.make(4, 0), np.random.default_rng(1)
+    root = rng.normal(size=(4, 4))
+    critic = QuadraticCritic(root @ root.T, rng.normal(size=4), rng.normal(size=4))
+    taylor = taylor_of(critic, monkeypatch)
+    x = rng.normal(size=(4, 6))
+    exact = -np.array(critic.V.map(6)(x, np.zeros((4, 6))))
+    for center in rng.normal(size=(3, 4, 1)):
+        theta = np.repeat(taylor.parameters(center), 6, axis=1)
+        np.testing.assert_allclose(np.array(taylor.cost.map(6)(x, theta)), exact, rtol=1e-9)
+    xs, g = ca.MX.sym("x", 4), ca.MX.sym("goal", 4)
+    stage, minus_v = ca.Function("s", [xs, g], [-ca.exp(-ca.sumsqr(xs))]), ca.Function("t", [xs, g], [-critic.V(xs, g)])
+    actions = []
+    for learned in (dict(terminal_cost=minus_v), dict(taylor=taylor, expand_at=np.zeros(4)), dict(taylor=taylor)):
+        mpc = deploy.ScenarioMPC(plant, 3, plant.SCENARIOS["mpc"], stage, goal=np.zeros(4), compile=False, tol=1e-9, **learned)
+        state = np.array([0.9, -0.5, 0.7, -0.9])
+        for _ in range(3):
+            actions.append(mpc.make_step(state))
+            state = plant.step(state, actions[-1])
+    for other in (actions[3:6], actions[6:]):
+        np.testing.assert_allclose(other, actions[:3], atol=1e-5)
+
+
+def test_a_value_that_is_not_concave_gives_a_bounded_terminal_cost(monkeypatch):
+    """In units of the box, negative curvature of -V is dropped and positive kept, slope and value are V's own."""
+    critic = QuadraticCritic(np.diag([2.0, -1.0, 0.5]), np.array([0.3, 0.0, -0.1]), np.zeros(3))
+    theta = taylor_of(critic, monkeypatch).parameters(np.zeros((3, 1)))[:, 0]
+    scale = critic.scaling["x_scale"]
+    np.testing.assert_allclose(theta[3], -3.0)
+    np.testing.assert_allclose(theta[4:7], [-0.3 * scale[0], 0, 0.1 * scale[2]], atol=1e-12)
+    np.testing.assert_allclose(theta[7:].reshape(3, 3), np.diag([4 * scale[0] ** 2, 0, scale[2] ** 2]), atol=1e-12)
+
+
+def test_expansion_of_a_critic_equals_torch(checkpoint):
+    """Value, gradient and Hessian by matrix products, in numpy and in CasADi's operations, for every combination of the twins."""
+    x, goal = np.array([0.8, 0.5, 110.0, 105.0]), np.array([0.65])
+    for combine in ("first", "min", "mean"):
+        critic = deploy.load_critic(checkpoint, "cstr", combine)
+        point = torch.tensor(x, requires_grad=True)
+
+        def value(v, critic=critic):
+            return critic.value(v[None], torch.tensor(goal)[None])[0]
+
+        expected = [value(point), torch.autograd.functional.jacobian(value, point), torch.autograd.functional.hessian(value, point)]
+        expansion = deploy.Expansion(critic)
+        xs, gs = ca.MX.sym("x", 4), ca.MX.sym("goal", 1)
+        for function in (expansion, ca.Function("symbolic", [xs, gs], list(expansion.symbolic(xs, gs)))):
+            for mine, theirs in zip(function(x, goal), expected):
+                np.testing.assert_allclose(np.array(mine).squeeze(), theirs.detach().numpy(), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("numpy_hessian", [False, True])
+def test_export_with_either_hessian_equals_torch(checkpoint, numpy_hessian):
+    critic = deploy.load_critic(checkpoint, "cstr")
+    V = deploy.export(critic, numpy_hessian)[2]
+    assert deploy.check_export(critic, V) < 1e-12
+    xs = ca.MX.sym("x", 4)
+    hessian = ca.Function("H", [xs], [ca.hessian(V(xs, 0.65), xs)[0]])
+    x = np.array([0.8, 0.5, 110.0, 105.0])
+    theirs = torch.autograd.functional.hessian(lambda v: critic.value(v[None], torch.tensor([[0.65]], dtype=v.dtype))[0], torch.tensor(x))
+    np.testing.assert_allclose(np.array(hessian(x)), theirs.numpy(), rtol=1e-9, atol=1e-12)
+
+
 def test_default_networks_are_the_papers():
     args = training.Args(env="linear", dim=32)
     agent = training.SAC(args, envs.load("linear", **args.plant_options), torch.device("cpu"))
@@ -275,3 +361,42 @@ def test_default_networks_are_the_papers():
     assert args.hidden == (256, 256) and args.total_timesteps == 500_000
     assert all(90_000 < size < 100_000 for size in sizes)
     assert training.Args().hidden == (64, 64) and training.Args(hidden=(8,), env="linear").hidden == (8,)
+
+
+# Command line
+
+
+def run_script(name, *arguments):
+    return subprocess.run([sys.executable, name, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.parametrize("objective", ["quadratic", "goal"])
+def test_goal_mpc_end_to_end(tmp_path, objective):
+    out = run_script("goal_mpc.py", "--env", "linear", "--dim", 14, "--system", 3, "--objective", objective, "--horizon", 6, "--steps", 8,
+                     "--control-horizon", 4, "--gamma", 0.99, "--episodes", 2, "--out", tmp_path)  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    rows = list(csv.DictReader(open(tmp_path / "results.csv")))
+    assert [row["env"] for row in rows] == ["linear"] * 2 and all(float(row["time_near_goal"]) > 2 for row in rows)
+    assert (tmp_path / "episode.png").stat().st_size > 10_000  # 28 states and actions, of which some are drawn
+
+
+@pytest.mark.parametrize(
+    "script, arguments, words",
+    [
+        ("goal_mpc.py", ["--env", "linear", "--dim", "0"], ["--dim", "0"]),
+        ("goal_mpc.py", ["--env", "cstr", "--dim", "3"], ["--dim", "cstr"]),
+        ("goal_mpc.py", ["--env", "linear", "--objective", "expert"], ["--objective expert"]),
+        ("goal_mpc.py", ["--env", "linear", "--control-horizon", "99"], ["--control-horizon", "99"]),
+        ("goal_mpc.py", ["--env", "cstr", "--control-horizon", "5"], ["--control-horizon"]),
+        ("goal_mpc.py", ["--env", "linear", "--discretization", "radau"], ["--discretization", "radau"]),
+        ("goal_mpc.py", ["--env", "linear", "--gamma", "0"], ["--gamma"]),
+        ("goal_mpc.py", ["--env", "linear", "--goal", "5,5"], ["--goal", "5,5"]),
+        ("sac_her_branching.py", ["--env", "linear", "--dim", "-1"], ["--dim", "-1"]),
+        ("sac_her_branching.py", ["--env", "cstr", "--system", "1"], ["--system", "cstr"]),
+        ("sac_her_branching.py", ["--env", "linear", "--alpha-init", "0"], ["--alpha-init"]),
+    ],
+)
+def test_bad_arguments_get_one_sentence_and_exit_code_2(script, arguments, words):
+    out = run_script(script, *arguments)
+    assert out.returncode == 2 and "Traceback" not in out.stderr
+    assert all(word in out.stderr for word in words), out.stderr
