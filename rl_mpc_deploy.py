@@ -195,61 +195,43 @@ def layers(critic):
     return actor, twins
 
 
-def mlp(layers, h, J, xp):
-    """Output of an MLP with SiLU, its Jacobian given that of h, and what `curvature` needs; xp numpy or casadi, h (n, 1), J (n, n_x)."""
-    tape = []
-    for w, b in layers[:-1]:
-        a, J = w @ h + b, w @ J
-        p = (1 + xp.tanh(a / 2)) / 2  # SiLU is a p; exp(-a) would overflow in its derivatives
-        first, second = p * (1 + a * (1 - p)), p * (1 - p) * (2 + a * (1 - 2 * p))
-        tape.append((w, J, first, second))
-        h, J = a * p, first * J
-    w, b = layers[-1]
-    return w @ h + b, w @ J, tape
+def export(critic):
+    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64."""
 
+    def mlp(layers, h):
+        for w, b in layers[:-1]:
+            h = w @ h + b
+            h = h * (1 + ca.tanh(h / 2)) / 2  # SiLU; exp(-h) would overflow in its derivatives
+        return layers[-1][0] @ h + layers[-1][1]
 
-def curvature(tape, adjoint):
-    """Adjoint of the MLP's input and its share of the Hessian, from the adjoint of its last hidden layer."""
-    hessian = 0
-    for w, J, first, second in reversed(tape):
-        hessian += J.T @ (adjoint * second * J)
-        adjoint = w.T @ (adjoint * first)
-    return adjoint, hessian
-
-
-def second_order(critic, z, J, xp):
-    """V at the features z (n_in, 1), its gradient with respect to them, and its Hessian along J (n_in, n_x), xp numpy or casadi.
-
-    The Hessian of a chain of linear maps and elementwise functions f is the sum over all of their inputs a of
-    (adjoint of f(a)) f''(a) (da/dx)(da/dx)'. Written so it takes a few matrix products, where automatic differentiation would send n_x
-    directions through the networks one by one: at n_x = 32 that is the difference between milliseconds and tens of them.
-    """
-    stack, (actor, twins), results = ca.vertcat if xp is ca else lambda *parts: np.vstack(parts), layers(critic), []
-    mean, J_mean, actor_tape = mlp(actor, z, J, xp)
-    action = xp.tanh(mean)
-    slope = 1 - action**2
-    for twin in twins[: 1 if critic.combine == "first" else 2]:
-        q, _, tape = mlp(twin, stack(z, action), stack(J, slope * J_mean), xp)
-        adjoint, hessian = curvature(tape, twin[-1][0].T)
-        d_z, d_action = adjoint[: z.shape[0], :], adjoint[z.shape[0] :, :]
-        through_actor, more = curvature(actor_tape, actor[-1][0].T @ (d_action * slope))
-        results.append((q, d_z + through_actor, hessian + more + J_mean.T @ (d_action * -2 * action * slope * J_mean)))
-    if len(results) == 1:
-        return results[0]
-    share = 0.5 if critic.combine == "mean" else results[0][0] <= results[1][0]
-    return tuple(share * a + (1 - share) * b for a, b in zip(*results))
+    s, (actor, twins) = critic.scaling, layers(critic)
+    x, goal, u = (ca.MX.sym(name, n) for name, n in (("x", s["x_center"].size), ("goal", s["goal_center"].size), ("u", s["u_center"].size)))
+    z = critic.features(x, goal, ca)
+    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor, z)) * s["u_scale"] + s["u_center"]])
+    q = [mlp(twin, ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])) for twin in twins]
+    combined = {"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]
+    Q = ca.Function("Q", [x, u, goal], [combined])
+    V = ca.Function("V", [x, goal], [Q(x, mu(x, goal), goal)], ["x", "goal"], ["V"])
+    return mu, Q, V
 
 
 class Expansion(ca.Callback):
-    """CasADi function (x, goal) -> V, its gradient (n_x,), its Hessian (n_x, n_x), physical units, that computes in numpy."""
+    """CasADi function (x, goal) -> V, its gradient (n_x,), its Hessian (n_x, n_x), physical units, that computes in numpy.
+
+    The Hessian of a chain of linear maps and elementwise functions f is the sum over all of their inputs a of
+    (adjoint of f(a)) f''(a) (da/dx)'(da/dx): a few matrix products, where CasADi would send n_x directions through the networks one by one
+    (0.5 ms against 40 at n_x = 32 and two networks of 256 x 256). Whoever uses it must keep it: CasADi does not.
+    """
 
     def __init__(self, critic):
         ca.Callback.__init__(self)
-        self.critic, self.n_x, self.n_goal = critic, len(critic.scaling["x_center"]), len(critic.scaling["goal_center"])
-        x, goal, adjoint = (ca.MX.sym(name, n) for name, n in (("x", self.n_x), ("goal", self.n_goal), ("adjoint", critic.network["n_in"])))
-        z = critic.features(x, goal, ca)
+        self.combine, (self.actor, self.twins) = critic.combine, layers(critic)
+        sizes = (("x", critic.scaling["x_center"].size), ("goal", critic.scaling["goal_center"].size), ("adjoint", critic.network["n_in"]))
+        x, goal, adjoint = (ca.MX.sym(*size) for size in sizes)
+        self.shapes, z = (x.shape, goal.shape, (x.numel(), x.numel())), critic.features(x, goal, ca)
         self.features = ca.Function("features", [x, goal], [z, ca.jacobian(z, x)])
-        self.bend = ca.Function("bend", [x, goal, adjoint], [ca.hessian(ca.dot(adjoint, z), x)[0]])  # of the features: zero without angles
+        self.bend = ca.Function("bend", [x, goal, adjoint], [ca.hessian(ca.dot(adjoint, z), x)[0]])  # zero unless there are angles
+        self.point, self.result = None, None  # the last: solvers ask for slope and curvature one after the other
         self.construct("expansion")
 
     def get_n_in(self):
@@ -259,57 +241,66 @@ class Expansion(ca.Callback):
         return 3
 
     def get_sparsity_in(self, i):
-        return ca.Sparsity.dense((self.n_x, self.n_goal)[i])
+        return ca.Sparsity.dense(*self.shapes[i])
 
     def get_sparsity_out(self, i):
-        return ca.Sparsity.dense(*((1, 1), (self.n_x, 1), (self.n_x, self.n_x))[i])
+        return ca.Sparsity.dense(*((1, 1), self.shapes[0], self.shapes[2])[i])
 
     def eval(self, arguments):
-        x, goal = arguments
-        z, J = (np.array(value) for value in self.features(x, goal))
-        v, d_z, hessian = second_order(self.critic, z, J, np)
-        return v, J.T @ d_z, hessian + np.array(self.bend(x, goal, d_z))
+        point = np.concatenate([np.array(value).ravel() for value in arguments])
+        if self.point is None or (point != self.point).any():
+            self.point, self.result = point, self._expand(arguments)
+        return self.result
 
-    def symbolic(self, x, goal):
-        """The same in CasADi's own operations, which can be compiled."""
-        z, J = self.features(x, goal)
-        v, d_z, hessian = second_order(self.critic, z, J, ca)
-        return v, J.T @ d_z, hessian + self.bend(x, goal, d_z)
+    def _expand(self, arguments):
+        def forward(layers, h, J):
+            """Output, its Jacobian, and what `backward` needs of each hidden layer: W, da/dx, f'(a), f''(a)."""
+            tape = []
+            for w, b in layers[:-1]:
+                a, J = w @ h + b, w @ J
+                p = (1 + np.tanh(a / 2)) / 2  # SiLU is a p
+                tape.append((w, J, p * (1 + a * (1 - p)), p * (1 - p) * (2 + a * (1 - 2 * p))))
+                h, J = a * p, tape[-1][2] * J
+            return layers[-1][0] @ h + layers[-1][1], layers[-1][0] @ J, tape
+
+        def backward(layers, tape, adjoint):
+            """Adjoint of the input and the share of the Hessian, from the adjoint of the output."""
+            adjoint, hessian = layers[-1][0].T @ adjoint, 0
+            for w, J, first, second in reversed(tape):
+                hessian += J.T @ (adjoint * second * J)
+                adjoint = w.T @ (adjoint * first)
+            return adjoint, hessian
+
+        z, J = (np.array(value) for value in self.features(*arguments))
+        mean, J_mean, actor_tape = forward(self.actor, z, J)
+        action = np.tanh(mean)
+        slope, results = 1 - action**2, []
+        for twin in self.twins:
+            q, _, tape = forward(twin, np.vstack([z, action]), np.vstack([J, slope * J_mean]))
+            adjoint, hessian = backward(twin, tape, np.ones((1, 1)))
+            d_z, d_action = np.vsplit(adjoint, [len(z)])
+            through_actor, more = backward(self.actor, actor_tape, d_action * slope)
+            d_z += through_actor
+            hessian += more + J_mean.T @ (d_action * -2 * action * slope * J_mean) + np.array(self.bend(*arguments, d_z))
+            results.append((q, J.T @ d_z, hessian))
+        chosen = {"first": results[:1], "min": [min(results, key=lambda r: r[0])], "mean": results}[self.combine]
+        return [sum(values) / len(chosen) for values in zip(*chosen)]
 
 
-def export(critic, numpy_hessian=False):
-    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64.
-
-    V has the derivatives of `second_order` with respect to x and none with respect to the goal. numpy_hessian: faster for large networks,
-    but cannot be compiled.
-    """
-    s, n_u, n_x, n_goal = critic.scaling, critic.network["n_u"], len(critic.scaling["x_center"]), len(critic.scaling["goal_center"])
-    x, goal, u = ca.MX.sym("x", n_x), ca.MX.sym("goal", n_goal), ca.MX.sym("u", n_u)
-    (actor, twins), z = layers(critic), critic.features(x, goal, ca)
-    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor, z, ca.MX(z.numel(), 1), ca)[0]) * s["u_scale"] + s["u_center"]])
-    za = ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])
-    q = [mlp(twin, za, ca.MX(za.numel(), 1), ca)[0] for twin in twins]
-    Q = ca.Function("Q", [x, u, goal], [{"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]])
-
-    critic.expansion = Expansion(critic)  # CasADi does not keep a Python object alive
-    v, gradient, hessian = critic.expansion.symbolic(x, goal)
-    if numpy_hessian:
-        hessian = critic.expansion(x, goal)[2]
-    state = ca.MX.sym("state", n_x + n_goal)
-    parts, blank = ca.vertsplit(state, [0, n_x, n_x + n_goal]), ca.MX(1, n_x + n_goal)
-    named = {"never_inline": True, "enable_forward": False, "enable_reverse": False}
-
-    def at(name, expression):
-        return ca.Function(name, [x, goal], [expression], {"never_inline": True})(*parts)
-
-    jac = ca.horzcat(at("value_slope", gradient).T, ca.MX(1, n_goal))
-    hess = ca.diagcat(at("value_hessian", hessian), ca.MX(n_goal, n_goal))
-    jac_jac = ca.Function("jac_jac_value", [state, ca.MX(1, 1), blank], [hess, blank.T],
+def with_derivatives(V, expansion):
+    """V with the derivatives of its expansion with respect to x, and none with respect to the goal, in place of CasADi's own."""
+    x, goal = ca.MX.sym("x", V.numel_in(0)), ca.MX.sym("goal", V.numel_in(1))
+    n, m = x.numel(), goal.numel()
+    state, by_goal, named = ca.MX.sym("state", n + m), ca.MX(1, m), {"never_inline": True, "enable_forward": False, "enable_reverse": False}
+    parts = ca.vertsplit(state, [0, n, n + m])
+    _, gradient, hessian = expansion(*parts)
+    blocks = [ca.diagcat(hessian, ca.MX(m, m)), ca.MX(n + m, 1)]
+    jac_jac = ca.Function("jac_jac_value", [state, ca.MX(1, 1), ca.MX(1, n + m)], blocks,
                           ["state", "out_v", "out_jac_v_state"], ["jac_jac_v_state_state", "jac_jac_v_state_out_v"], named)  # fmt: skip
-    jac = ca.Function("jac_value", [state, ca.MX(1, 1)], [jac], ["state", "out_v"], ["jac_v_state"], named | {"custom_jacobian": jac_jac})
-    value = ca.Function("value", [state], [at("value_only", v)], ["state"], ["v"], named | {"custom_jacobian": jac})
-    V = ca.Function("V", [x, goal], [value(ca.vertcat(x, goal))], ["x", "goal"], ["V"])
-    return mu, Q, V
+    jac = ca.Function("jac_value", [state, ca.MX(1, 1)], [ca.horzcat(gradient.T, by_goal)], ["state", "out_v"], ["jac_v_state"],
+                      named | {"custom_jacobian": jac_jac})  # fmt: skip
+    value = ca.Function("value", [state], [V(*parts)], ["state"], ["v"], named | {"custom_jacobian": jac})
+    return ca.Function("V", [x, goal], [value(ca.vertcat(x, goal))], ["x", "goal"], ["V"])
 
 
 def check_export(critic, V, points=64, tolerance=1e-8):
@@ -338,21 +329,20 @@ class TaylorValue:
     the box of initial states, is projected: negative eigenvalues become zero.
     """
 
-    def __init__(self, critic, goal):
-        self.expansion, self.goal, self.scale = Expansion(critic), goal, critic.scaling["x_scale"]
-        self.n = len(self.scale)
-        x, theta = ca.MX.sym("x", self.n), ca.MX.sym("theta", 1 + 2 * self.n + self.n**2)
+    def __init__(self, expansion, goal, scale):
+        self.expansion, self.goal, self.scale, n = expansion, goal, scale, len(scale)
+        x, theta = ca.MX.sym("x", n), ca.MX.sym("theta", 1 + 2 * n + n**2)
         # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
-        center, v, slope, hessian = ca.vertsplit(theta, np.cumsum([0, self.n, 1, self.n, self.n**2]).tolist())
-        dx = (x - center) / self.scale
-        cost = v + ca.dot(slope, dx) + ca.bilin(ca.reshape(hessian, self.n, self.n), dx, dx) / 2
+        center, v, slope, curvature = ca.vertsplit(theta, np.cumsum([0, n, 1, n, n**2]).tolist())
+        dx = (x - center) / scale
+        cost = v + ca.dot(slope, dx) + ca.bilin(ca.reshape(curvature, n, n), dx, dx) / 2
         self.cost = ca.Function("taylor", [x, theta], [cost])
 
     def parameters(self, x):
         """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points)."""
         columns = []
         for point in x.T:
-            v, gradient, hessian = (np.array(value) for value in self.expansion.eval((point, self.goal)))
+            v, gradient, hessian = (np.array(value) for value in self.expansion(point, self.goal))
             eigenvalues, vectors = np.linalg.eigh(-hessian * np.outer(self.scale, self.scale))
             projected = vectors * np.maximum(eigenvalues, 0) @ vectors.T
             columns.append(np.concatenate([point, -v.ravel(), -gradient.ravel() * self.scale, projected.ravel()]))
@@ -633,7 +623,7 @@ class ScenarioMPC:
             if self.plan is not None:
                 w, *multipliers = self.plan
                 shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
-                if self.actor is None or self._cost(x0, shifted) <= self._cost(x0, guess[0]):
+                if self.actor is None or self._cost(x0, guess[0]) >= self._cost(x0, shifted):
                     start, guess = "warm", (shifted, *multipliers)
         self._expand(guess[0])
         solution = self._solve(start, x0, self.slack_price, *guess)
@@ -726,7 +716,7 @@ def build_controller(name, args):
     critic = load_critic(critic_path(args), args.env, "min" if greedy else args.combine)
     plant = critic.plant
     compile = args.compile and not hasattr(plant, "next_state")
-    mu, Q, V = export(critic, numpy_hessian=not compile)
+    mu, Q, V = export(critic)
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
     if name == "actor":
         return ActorController(plant, mu, goal)
@@ -737,14 +727,17 @@ def build_controller(name, args):
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        learned = {}
+        learned, expansion = {}, Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
+            V = V if compile else with_derivatives(V, expansion)
             learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
-            learned = dict(actor=mu, taylor=TaylorValue(critic, goal), expand_at=point)
-        return ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
-                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
+            learned = dict(actor=mu, taylor=TaylorValue(expansion, goal, critic.scaling["x_scale"]), expand_at=point)
+        mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
+                          slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
+        mpc.expansion = expansion
+        return mpc
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,

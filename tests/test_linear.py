@@ -274,35 +274,24 @@ def test_training_and_deployment_run_on_it(tmp_path):
 # Expanded values
 
 
-class QuadraticCritic:
-    """What TaylorValue and the controllers ask of a critic, for V = v0 + b'(x - c) - (x - c)'S(x - c) in CasADi."""
-
-    def __init__(self, S, b, c):
-        self.n = len(c)
-        self.scaling = {"x_scale": np.linspace(0.5, 2, self.n)}
-        x, goal = ca.MX.sym("x", self.n), ca.MX.sym("goal", self.n)
-        self.V = ca.Function("V", [x, goal], [3.0 + ca.dot(b, x - c) - ca.bilin(ca.DM(S), x - c, x - c)])
-        derivatives = [self.V(x, goal), ca.gradient(self.V(x, goal), x), ca.hessian(self.V(x, goal), x)[0]]
-        self.function = ca.Function("expansion", [x, goal], derivatives)
+def quadratic_taylor(S, b, c, scale):
+    """V = 3 + b'(x - c) - (x - c)'S(x - c), and its TaylorValue."""
+    x, goal = ca.MX.sym("x", len(c)), ca.MX.sym("goal", len(c))
+    V = ca.Function("V", [x, goal], [3.0 + ca.dot(b, x - c) - ca.bilin(ca.DM(S), x - c, x - c)])
+    expansion = ca.Function("E", [x, goal], [V(x, goal), ca.gradient(V(x, goal), x), ca.hessian(V(x, goal), x)[0]])
+    return V, deploy.TaylorValue(expansion, np.zeros(len(c)), scale)
 
 
-def taylor_of(critic, monkeypatch):
-    monkeypatch.setattr(deploy, "Expansion", lambda critic: type("E", (), {"eval": staticmethod(lambda args: critic.function(*args))}))
-    return deploy.TaylorValue(critic, np.zeros(critic.n))
-
-
-def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equal(monkeypatch):
+def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equal():
     plant, rng = linear.make(4, 0), np.random.default_rng(1)
     root = rng.normal(size=(4, 4))
-    critic = QuadraticCritic(root @ root.T, rng.normal(size=4), rng.normal(size=4))
-    taylor = taylor_of(critic, monkeypatch)
+    V, taylor = quadratic_taylor(root @ root.T, rng.normal(size=4), rng.normal(size=4), np.linspace(0.5, 2, 4))
     x = rng.normal(size=(4, 6))
-    exact = -np.array(critic.V.map(6)(x, np.zeros((4, 6))))
     for center in rng.normal(size=(3, 4, 1)):
         theta = np.repeat(taylor.parameters(center), 6, axis=1)
-        np.testing.assert_allclose(np.array(taylor.cost.map(6)(x, theta)), exact, rtol=1e-9)
+        np.testing.assert_allclose(np.array(taylor.cost.map(6)(x, theta)), -np.array(V.map(6)(x, np.zeros((4, 6)))), rtol=1e-9)
     xs, g = ca.MX.sym("x", 4), ca.MX.sym("goal", 4)
-    stage, minus_v = ca.Function("s", [xs, g], [-ca.exp(-ca.sumsqr(xs))]), ca.Function("t", [xs, g], [-critic.V(xs, g)])
+    stage, minus_v = ca.Function("s", [xs, g], [-ca.exp(-ca.sumsqr(xs))]), ca.Function("t", [xs, g], [-V(xs, g)])
     actions = []
     for learned in (dict(terminal_cost=minus_v), dict(taylor=taylor, expand_at=np.zeros(4)), dict(taylor=taylor)):
         mpc = deploy.ScenarioMPC(plant, 3, plant.SCENARIOS["mpc"], stage, goal=np.zeros(4), compile=False, tol=1e-9, **learned)
@@ -314,44 +303,45 @@ def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equ
         np.testing.assert_allclose(other, actions[:3], atol=1e-5)
 
 
-def test_a_value_that_is_not_concave_gives_a_bounded_terminal_cost(monkeypatch):
+def test_a_value_that_is_not_concave_gives_a_bounded_terminal_cost():
     """In units of the box, negative curvature of -V is dropped and positive kept, slope and value are V's own."""
-    critic = QuadraticCritic(np.diag([2.0, -1.0, 0.5]), np.array([0.3, 0.0, -0.1]), np.zeros(3))
-    theta = taylor_of(critic, monkeypatch).parameters(np.zeros((3, 1)))[:, 0]
-    scale = critic.scaling["x_scale"]
+    scale = np.array([0.5, 1.0, 2.0])
+    _, taylor = quadratic_taylor(np.diag([2.0, -1.0, 0.5]), np.array([0.3, 0.0, -0.1]), np.zeros(3), scale)
+    theta = taylor.parameters(np.zeros((3, 1)))[:, 0]
     np.testing.assert_allclose(theta[3], -3.0)
     np.testing.assert_allclose(theta[4:7], [-0.3 * scale[0], 0, 0.1 * scale[2]], atol=1e-12)
     np.testing.assert_allclose(theta[7:].reshape(3, 3), np.diag([4 * scale[0] ** 2, 0, scale[2] ** 2]), atol=1e-12)
 
 
-def test_expansion_of_a_critic_equals_torch(checkpoint):
-    """Value, gradient and Hessian by matrix products, in numpy and in CasADi's operations, for every combination of the twins."""
-    x, goal = np.array([0.8, 0.5, 110.0, 105.0]), np.array([0.65])
-    for combine in ("first", "min", "mean"):
-        critic = deploy.load_critic(checkpoint, "cstr", combine)
-        point = torch.tensor(x, requires_grad=True)
+@pytest.mark.parametrize("combine", ["first", "min", "mean"])
+def test_expansion_by_matrix_products_equals_torch_also_as_derivatives_of_v(checkpoint, combine):
+    critic, goal = deploy.load_critic(checkpoint, "cstr", combine), np.array([0.65])
+    expansion = deploy.Expansion(critic)
+    V = deploy.with_derivatives(deploy.export(critic)[2], expansion)
+    assert deploy.check_export(critic, V) < 1e-12  # value and gradient
+    x = ca.MX.sym("x", 4)
+    derivatives = ca.Function("derivatives", [x], [V(x, goal), ca.gradient(V(x, goal), x), ca.hessian(V(x, goal), x)[0]])
 
-        def value(v, critic=critic):
-            return critic.value(v[None], torch.tensor(goal)[None])[0]
+    def value(v):
+        return critic.value(v[None], torch.tensor(goal)[None])[0]
 
-        expected = [value(point), torch.autograd.functional.jacobian(value, point), torch.autograd.functional.hessian(value, point)]
-        expansion = deploy.Expansion(critic)
-        xs, gs = ca.MX.sym("x", 4), ca.MX.sym("goal", 1)
-        for function in (expansion, ca.Function("symbolic", [xs, gs], list(expansion.symbolic(xs, gs)))):
-            for mine, theirs in zip(function(x, goal), expected):
-                np.testing.assert_allclose(np.array(mine).squeeze(), theirs.detach().numpy(), rtol=1e-9, atol=1e-12)
+    for point in envs.sample_states(critic.plant, np.random.default_rng(0), 20):
+        there = torch.tensor(point)
+        expected = value(there), torch.autograd.functional.jacobian(value, there), torch.autograd.functional.hessian(value, there)
+        for mine in (derivatives(point), expansion(point, goal)):
+            for a, b in zip(mine, expected):
+                b = b.detach().numpy()
+                np.testing.assert_allclose(np.array(a).squeeze(), b, rtol=1e-8, atol=1e-10 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("numpy_hessian", [False, True])
-def test_export_with_either_hessian_equals_torch(checkpoint, numpy_hessian):
-    critic = deploy.load_critic(checkpoint, "cstr")
-    V = deploy.export(critic, numpy_hessian)[2]
-    assert deploy.check_export(critic, V) < 1e-12
-    xs = ca.MX.sym("x", 4)
-    hessian = ca.Function("H", [xs], [ca.hessian(V(xs, 0.65), xs)[0]])
-    x = np.array([0.8, 0.5, 110.0, 105.0])
-    theirs = torch.autograd.functional.hessian(lambda v: critic.value(v[None], torch.tensor([[0.65]], dtype=v.dtype))[0], torch.tensor(x))
-    np.testing.assert_allclose(np.array(hessian(x)), theirs.numpy(), rtol=1e-9, atol=1e-12)
+def test_hessian_sees_the_curvature_of_sines_and_cosines(tmp_path):
+    args = training.Args(env="double_pendulum", seed=1)
+    agent = training.SAC(args, envs.load("double_pendulum"), torch.device("cpu"))
+    training.save(training.checkpoint(agent, training.plain(args), step=0), tmp_path / "c.pt")
+    critic = deploy.load_critic(tmp_path / "c.pt", "double_pendulum")
+    x, goal = np.array([0.3, 2.0, -1.0, 0.5, 1.0, -2.0]), np.array([0.0, 3.0])
+    theirs = torch.autograd.functional.hessian(lambda v: critic.value(v[None], torch.tensor(goal)[None])[0], torch.tensor(x)).numpy()
+    np.testing.assert_allclose(np.array(deploy.Expansion(critic)(x, goal)[2]), theirs, rtol=1e-8, atol=1e-12)
 
 
 def test_default_networks_are_the_papers():
