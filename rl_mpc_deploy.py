@@ -84,7 +84,7 @@ class Args:
     constraints: Literal["soft", "hard"] = "soft"
     """RL+MPC: hard is the paper's variant that gets stuck or infeasible"""
     value: Literal["exact", "taylor", "taylor-local"] = "exact"
-    """RL+MPC: V itself, or its concave second-order expansion about the goal, or about where the previous plan ends"""
+    """RL+MPC: V itself, or its concave second-order expansion about the goal, or about where each scenario's first guess ends"""
     combine: Literal["min", "first", "mean"] = "first"
     """which of the twin critics V takes; their minimum has kinks, where the solver stalls"""
     controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
@@ -524,7 +524,8 @@ class ScenarioMPC:
         self.u_before = np.zeros(self.n_u)  # the reference's convention for the input-change penalty
         self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
         self.plan_left = 0  # actions that it still holds
-        self.last, self.x_before = None, None  # the solution of the previous step, if it succeeded, and its state
+        self.last = None  # the solution of the previous step, if it succeeded
+        self.x_compared = None  # the state at which guesses were last compared
         self.last_w = None
         self.stats = {}
 
@@ -618,23 +619,24 @@ class ScenarioMPC:
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
         start, guess = "warm", self.last
-        if self.last is None or (np.abs(x0 - self.x_before) > 1e-3 * self.x_scale).any():  # else the last plan itself is the best guess
-            start, guess = "cold", (self.cold_guess(x0),)
+        # where the plant has hardly moved since the guesses were last compared, the last plan itself is the best one
+        if self.last is None or (np.abs(x0 - self.x_compared) > 1e-3 * self.x_scale).any():
+            start, guess, self.x_compared = "cold", (self.cold_guess(x0),), x0
             if self.plan is not None:
                 w, *multipliers = self.plan
                 shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
-                if self.actor is None or self._cost(x0, guess[0]) >= self._cost(x0, shifted):
+                no_rival = self.actor is None and not hasattr(self.plant, "baseline")
+                if no_rival or self._cost(x0, guess[0]) >= self._cost(x0, shifted):
                     start, guess = "warm", (shifted, *multipliers)
         self._expand(guess[0])
         solution = self._solve(start, x0, self.slack_price, *guess)
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
-            cold = self.cold_guess(x0)
-            if self.relaxed_price is not None:
-                solution = self._solve("cold", x0, np.full((2, self.n_x), self.relaxed_price), cold)
-            else:
-                solution = self._solve("cold", x0, self.slack_price, cold if start == "warm" else self.hold_guess(x0))
-        self.last, self.x_before = solution, x0
+            other = self.cold_guess(x0) if start == "warm" or self.relaxed_price is not None else self.hold_guess(x0)
+            self._expand(other)
+            price = self.slack_price if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
+            solution = self._solve("cold", x0, price, other)
+        self.last = solution
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
         elif self.plan_left > 0:

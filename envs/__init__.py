@@ -19,12 +19,17 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     REWARD_SIGMA2, REWARD_TOLERANCE, MPC_SIGMA2   width of the Gaussian reward, half-width of the sparse one, width in goal_mpc.py
     ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
     MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
+    TRAINING                                      arguments of sac_her_branching.py whose defaults it changes, {} for none
 optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), animate(...)
+
+A family of plants (`envs/linear.py`) defines `make(dim, system)` instead, which returns an object with these names. A plant in discrete
+time has next_state(x, u, psi, xp) instead of ode; one with a linear-quadratic regulator lqr, lq_cost, lq_value, feedback and baseline.
 
 `GoalEnv` and `VectorGoalEnv` below turn such a module into environments; importing `envs` registers one id per module.
 """
 
 import importlib
+import inspect
 import pkgutil
 
 import gymnasium as gym
@@ -70,11 +75,11 @@ def load(name, **options):
     if name not in names():
         raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(names())}")
     module, options = importlib.import_module(f"{__name__}.{name}"), {k: v for k, v in options.items() if v is not None}
-    if hasattr(module, "make"):
-        return module.make(**options)
-    if options:
-        raise ValueError(f"--{next(iter(options))} is not an option of --env {name}, which is a single plant")
-    return module
+    known = inspect.signature(module.make).parameters if hasattr(module, "make") else ()
+    for option in options:
+        if option not in known:
+            raise ValueError(f"--{option} is not an option of --env {name}")
+    return module.make(**options) if hasattr(module, "make") else module
 
 
 def sample_states(plant, rng, n):

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import os
+import signal
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -37,7 +38,8 @@ def collect(function, cells, jobs, folder, inputs):
     """
     version = hashlib.sha256(b"".join(Path(file).read_bytes() for file in inputs)).digest()
     paths = [folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells]
-    with ProcessPoolExecutor(jobs) as pool:
+    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
+    with ProcessPoolExecutor(jobs, **quit_at_once) as pool:
         futures = [pool.submit(_fill, function, cell, path) for cell, path in zip(cells, paths) if not path.exists()]
         try:
             for future in tqdm(as_completed(futures), initial=len(cells) - len(futures), total=len(cells), unit="cell", disable=None):

@@ -7,13 +7,13 @@
     python experiments/linear_value_mpc.py --study profile --plot-only
 
 The agents are those of `python sac_her_branching.py --env linear --dim 32 --system I --seed I`; the scaling study has one more for each
-smaller n, of 100,000 transitions. Every controller has the stage cost
--exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an
-expansion of -V about the goal (taylor) or about where the previous plan ends (taylor-local). Beside them the goal-conditioned MPC of
-linear_scalability.py, whose costs contain the input and whose terminal cost is the regulator's.
+smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a price of 1
+(rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an expansion of -V about the goal (taylor) or about where the first
+guess ends (taylor-local). Beside them the goal-conditioned MPC of linear_scalability.py, whose costs contain the input and whose terminal
+cost is the regulator's.
 
-Writes results/linear_training.csv, linear_value_mpc.csv and linear_profile.csv, linear_distance.csv, linear_times.csv, and the figures
-linear_value_mpc.png, linear_distance.png and linear_times.png.
+Writes results/linear_value_mpc_NAME.csv for NAME in training, profile, distance, times, linear_value_mpc.csv (a row per closed loop of the
+profile study), and the figures linear_value_mpc.png, linear_value_mpc_distance.png and linear_value_mpc_times.png.
 """
 
 import csv
@@ -53,7 +53,7 @@ CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None
     "RL+MPC, taylor-local": ("#CC79A7", (0, (3, 1, 1, 1)), dict(controllers=("rl_mpc",), value="taylor-local")),
 }
 SCALING_DIMENSIONS, SCALING_HORIZONS = (2, 4, 8, 16), (2, 5, 10, 20, 40)  # beside --dim
-DISTANCE_HORIZONS, DISTANCES = (1, 2, 5, 10), (0.1, 0.3, 1.0, 1.5)
+DISTANCE_HORIZONS, DISTANCES = (1, 2, 5, 10), (0.1, 0.3, 1.0, 2.0, 3.0)
 MEASURES = ("steps_not_near", "l2_error", "constraint_violation")
 
 
@@ -66,9 +66,9 @@ class Args:
     systems: int = 10
     """random systems, one agent each"""
     starts: int = 10
-    """initial states per system"""
+    """initial states per system (distance: 2 at most, scaling: 5)"""
     steps: int = 50
-    """sampling times per episode"""
+    """sampling times per episode (distance and scaling: 20 at most)"""
     horizon: int = 5
     """N of every controller that plans"""
     seed: int = 0
@@ -116,7 +116,9 @@ def train(args, dim, system):
             if args.quick:
                 command += ["--total-timesteps", "2000", "--learning-starts", "500", "--eval-every", "1000", "--hidden", "16", "16"]
         tick = time.perf_counter()
-        subprocess.run(command, check=True, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        result = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        if result.returncode:
+            raise RuntimeError(f"training of system {system} stopped: {result.stderr[-2000:]}")
         run = max(parent.iterdir(), key=lambda path: path.stat().st_mtime)
         (run / "resume.pt").unlink()  # as large as the replay buffer
         (run / "wall_seconds.txt").write_text(f"{time.perf_counter() - tick:.1f}")
@@ -136,15 +138,15 @@ def train_all(args):
     ]
     with ThreadPoolExecutor(args.jobs) as pool:
         rows = list(tqdm(pool.map(lambda agent: train(args, *agent), agents), total=len(agents), unit="agent", disable=None))
-    cells.write(rows, args.out / "results/linear_training.csv")
+    cells.write(rows, args.out / "results/linear_value_mpc_training.csv")
     rows = rows[: args.systems]
     print("system  updates  seconds  error %, median  75th percentile  (root mean square of the state over steps 26 to 50)")
     for row in rows:
         print(
-            f"{row['system']:6d}{row['updates']:>9s}{float(row['wall_seconds']):9.0f}{float(row['error_median']):17.2f}{float(row['error_p75']):17.2f}"
+            f"{row['system']:6d}{row['updates']:>9s}{float(row['train_seconds']):9.0f}{float(row['error_median']):17.2f}{float(row['error_p75']):17.2f}"
         )
     print(f"median over systems {np.median([float(row['error_median']) for row in rows]):.2f} %, "
-          f"at most {max(float(row['wall_seconds']) for row in rows):.0f} s per agent")  # fmt: skip
+          f"at most {max(float(row['train_seconds']) for row in rows):.0f} s per agent")  # fmt: skip
 
 
 # Closed loops
@@ -191,14 +193,15 @@ def start_states(dim, system, starts):
 
 def run_cell(cell):
     """One controller on one system from every start, at one horizon and at some distances: rows, each with its profile as text."""
-    label, dim, system, horizon, scales, starts, steps, critic = cell
+    label, dim, system, horizon, scales, starts, steps, critic, jobs = cell
     torch.set_num_threads(1)
     controller, (plant, x0s) = build(label, dim, system, horizon, Path(critic)), start_states(dim, system, starts)
     rows = []
     for scale in scales:
         for i, x0 in enumerate(x0s):
             x, log = run_loop(controller, plant, scale * x0, steps)
-            head = {"controller": label, "n": dim, "horizon": horizon, "system": system, "start": i, "scale": scale}
+            head = {"controller": label, "n": dim, "horizon": horizon, "system": system, "start": i, "scale": scale,
+                    "jobs": jobs}  # fmt: skip
             rows.append(head | {k: round(float(v), 5) for k, v in measures(plant, x, log).items()}
                         | {"norms": " ".join(f"{v:.4g}" for v in np.linalg.norm(x, axis=1)),
                            "times": " ".join(f"{s['wall_ms']:.4g}" for s in log)})  # fmt: skip
@@ -215,7 +218,7 @@ def without(row, *keys):
 
 def collect(args, labels, horizons, scales):
     work = [
-        (label, args.dim, system, horizon, scales, args.starts, args.steps, str(checkpoint(args, args.dim, system)))
+        (label, args.dim, system, horizon, scales, args.starts, args.steps, str(checkpoint(args, args.dim, system)), args.jobs)
         for horizon in horizons
         for label in labels
         if not (label == "RL (actor alone)" and horizon != horizons[0])
@@ -236,7 +239,7 @@ def profile(args):
             late = np.minimum(t, times.shape[1] - 1)  # no action is computed at the last state: its time is repeated
             curve |= dict(zip(("ms_low", "ms_median", "ms_high"), np.quantile(times[:, late], [0.025, 0.5, 0.95])))
             curves.append({"controller": label, "step": t} | {k: round(float(v), 6) for k, v in curve.items()})
-    cells.write(curves, args.out / "results/linear_profile.csv")
+    cells.write(curves, args.out / "results/linear_value_mpc_profile.csv")
 
 
 def paired(rows, label):
@@ -245,24 +248,27 @@ def paired(rows, label):
 
 
 def plot_profile(args):
-    rows, curves = (cells.read(args.out / f"results/{name}.csv") for name in ("linear_value_mpc", "linear_profile"))
+    rows, curves = (cells.read(args.out / f"results/{name}.csv") for name in ("linear_value_mpc", "linear_value_mpc_profile"))
     fig, axes = plt.subplots(2, 1, figsize=(8, 6.4), sharex=True, layout="constrained")
     baseline = {}
-    print(f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'ms median':>11s}{'first 5':>9s}{'worst':>8s}{'failed':>8s}")
+    print(f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}{'ms median':>11s}"
+          f"{'first 5':>9s}{'worst':>8s}{'failed':>8s}")  # fmt: skip
     for label, (colour, dashes, _) in CONTROLLERS.items():
         mine = {key: np.array([row[key] for row in curves if row["controller"] == label]).astype(float) for key in list(curves[0])[1:]}
         for ax, key in zip(axes, ("norm", "ms")):
             if key == "norm" or "actor" not in label:
                 ax.plot(mine["step"], mine[f"{key}_median"], color=colour, ls=dashes, lw=2, label=label)
                 ax.fill_between(mine["step"], mine[f"{key}_low"], mine[f"{key}_high"], color=colour, alpha=0.12, lw=0)
-        mine = {key: np.array([float(row[key]) for row in rows if row["controller"] == label]) for key in list(rows[0])[6:]}
+        mine = {key: np.array([float(row[key]) for row in rows if row["controller"] == label]) for key in list(rows[0])[7:]}
         baseline[label] = {key: np.median(values) for key, values in mine.items()}
         spread = "".join(
             f"{np.median(mine[k]):8.2f} [{np.quantile(mine[k], 0.025):5.2f},{np.quantile(mine[k], 0.95):6.2f}]" for k in MEASURES[:2]
         )
-        violation, milliseconds, early = (baseline[label][key] for key in ("constraint_violation", "solve_ms_median", "solve_ms_transient"))
+        violation, end, milliseconds, early = (
+            baseline[label][key] for key in ("constraint_violation", "final_norm", "solve_ms_median", "solve_ms_transient")
+        )
         worst, failed = mine["solve_ms_max"].max(), mine["solver_failures"].sum()
-        print(f"{label:42s}{spread}{violation:10.2f}{milliseconds:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}")
+        print(f"{label:42s}{spread}{violation:10.2f}{end:9.4f}{milliseconds:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}")
     plain = baseline["goal-conditioned MPC, no value"]
     for label in list(CONTROLLERS)[3:]:
         print(f"{label}: solve time over that without a value, median {baseline[label]['solve_ms_median'] / plain['solve_ms_median']:.2f}, "
@@ -295,11 +301,11 @@ def distance(args):
     horizons, scales = ((1, 2), (0.1, 1.0)) if args.quick else (DISTANCE_HORIZONS, DISTANCES)
     labels = [label for label in CONTROLLERS if "regulator" not in label]
     rows = collect(args, labels, horizons, scales)
-    cells.write([without(row, "norms", "times") for row in rows], args.out / "results/linear_distance.csv")
+    cells.write([without(row, "norms", "times") for row in rows], args.out / "results/linear_value_mpc_distance.csv")
 
 
 def plot_distance(args):
-    rows = cells.read(args.out / "results/linear_distance.csv")
+    rows = cells.read(args.out / "results/linear_value_mpc_distance.csv")
     horizons, scales = (list(dict.fromkeys(row[key] for row in rows)) for key in ("horizon", "scale"))
     labels = [label for label in CONTROLLERS if any(row["controller"] == label for row in rows)]
     fig, axes = plt.subplots(1, len(horizons), figsize=(10, 3.6), sharey=True, layout="constrained", squeeze=False)
@@ -317,7 +323,7 @@ def plot_distance(args):
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("steps not near the origin")
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    save(fig, args.out / "figures/linear_distance.png")
+    save(fig, args.out / "figures/linear_value_mpc_distance.png")
 
 
 # Scaling
@@ -332,15 +338,15 @@ def scaling(args):
     dimensions, horizons = scaling_dimensions(args), SCALING_HORIZONS[: 2 if args.quick else None]
     starts, steps, rows = min(args.starts, 5), min(args.steps, 20), []
     for axis, pairs in (("n", [(n, args.horizon) for n in dimensions]), ("horizon", [(dimensions[-1], N) for N in horizons])):
-        work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)))
+        work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)), args.jobs)
                 for n, N in pairs for label in CONTROLLERS if "actor" not in label]  # fmt: skip
         found = cells.collect(run_cell, work, args.jobs, args.runs / "scaling", inputs())
         rows += [{"axis": axis} | without(row, "norms", "times") for row in found]
-    cells.write(rows, args.out / "results/linear_times.csv")
+    cells.write(rows, args.out / "results/linear_value_mpc_times.csv")
 
 
 def plot_scaling(args):
-    rows = cells.read(args.out / "results/linear_times.csv")
+    rows = cells.read(args.out / "results/linear_value_mpc_times.csv")
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")
     labels = [label for label in CONTROLLERS if "actor" not in label]
     for ax, axis in zip(axes, ("n", "horizon")):
@@ -359,7 +365,7 @@ def plot_scaling(args):
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("solve time, mean of steps 1 to 5 [ms]")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    save(fig, args.out / "figures/linear_times.png")
+    save(fig, args.out / "figures/linear_value_mpc_times.png")
 
 
 def main(args):

@@ -21,14 +21,21 @@ EXPERIMENTS = {
 FIGURES = {name: name for name in EXPERIMENTS} | {"dip_equilibria": "dip_profile"}
 LINEAR_TABLES = (
     "linear_scalability",
-    "linear_sweep",
-    "linear_training",
+    "linear_scalability_sweep",
+    "linear_value_mpc_training",
     "linear_value_mpc",
-    "linear_profile",
-    "linear_distance",
-    "linear_times",
+    "linear_value_mpc_profile",
+    "linear_value_mpc_distance",
+    "linear_value_mpc_times",
 )
-LINEAR_FIGURES = {"linear_scalability", "linear_jensen", "linear_sweep", "linear_value_mpc", "linear_distance", "linear_times"}
+LINEAR_FIGURES = {
+    "linear_scalability",
+    "linear_scalability_jensen",
+    "linear_scalability_sweep",
+    "linear_value_mpc",
+    "linear_value_mpc_distance",
+    "linear_value_mpc_times",
+}
 LINEAR_STUDIES = [("linear_scalability", "main"), ("linear_scalability", "sweep")]
 LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distance", "scaling")]
 NO_RUNS = {"cstr_profile", "dip_equilibria"}  # too short to be kept in parts

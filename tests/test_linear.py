@@ -1,6 +1,7 @@
 """Linear systems: the regulator against scipy and the Bellman equation, LQ-MPC against the regulator, eq:jensen, real clients."""
 
 import csv
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -225,6 +226,25 @@ def test_trajectory_costs_are_the_controllers_own():
         assert sides[side] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize("n", [2, 8])
+def test_closed_loops_satisfy_jensen_and_goal_conditioned_plans_have_the_larger_right_side(n):
+    """The second half is no theorem: a local optimum or a saved violation may break it. On these systems nothing does."""
+    settings = study.BASE | {"steps": 12}
+    rows = [row for system in range(2) for row in study.run_system(("base", tuple(settings.items()), n, system, 2))]
+    assert all(row["jensen_log_left"] < row["jensen_log_right"] <= 0 for row in rows)
+    goal = [row for row in rows if row["controller"] == "goal"]
+    assert [row["plans_compared"] for row in goal] == [12] * 4
+    assert sum(row["plans_worse"] + row["plans_costlier"] for row in goal) == 0
+    plant = study.make_plant(n, 0, settings)  # and that count is not vacuous: the roles exchanged, LQ-MPC's plans are worse
+    lq, mpc = (study.controller(plant, objective, settings) for objective in study.CONTROLLERS)
+    x0 = envs.sample_states(plant, np.random.default_rng([n, 0, 1]), 1)[0]
+    for controller in (lq, mpc):
+        controller.make_step(x0)
+    (side, cost), (best_side, best_cost) = (study.judged_plan(controller, x0, settings["price"]) for controller in (lq, mpc))
+    assert side < best_side - 1e-4 and cost > best_cost + 1e-4
+    assert best_cost == pytest.approx(mpc.last_objective, abs=1e-4)  # slack ends near, not at, zero
+
+
 # Clients
 
 
@@ -253,6 +273,8 @@ def test_a_plant_that_is_not_there_is_one_sentence():
     for options in ({"dim": 0}, {"dim": 3, "system": -1}, {"dim": 10**6}):
         with pytest.raises(ValueError, match="--dim"):
             envs.load("linear", **options)
+    with pytest.raises(ValueError, match="--color is not an option of --env linear"):
+        envs.load("linear", color=1)
     with pytest.raises(ValueError, match="--dim is not an option of --env cstr"):
         envs.load("cstr", dim=3)
 
@@ -332,6 +354,30 @@ def test_expansion_by_matrix_products_equals_torch_also_as_derivatives_of_v(chec
             for a, b in zip(mine, expected):
                 b = b.detach().numpy()
                 np.testing.assert_allclose(np.array(a).squeeze(), b, rtol=1e-8, atol=1e-10 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("value", ["exact", "taylor-local"])
+def test_controllers_keep_what_casadi_calls_back(checkpoint, value):
+    """Python's garbage collector must not take the expansion away while the solver uses it."""
+    mpc = deploy.build_controller("rl_mpc", deploy.Args(critic=checkpoint, horizon=2, value=value, compile=False))
+    gc.collect()
+    mpc.make_step(np.array([0.8, 0.5, 134.14, 130.0]))
+    assert mpc.stats["rung"] == "solved"
+
+
+def test_a_settled_plant_starts_from_the_last_plan(checkpoint):
+    mpc = deploy.build_controller("rl_mpc", deploy.Args(critic=checkpoint, horizon=3, compile=False))
+    x = np.array([0.8, 0.5, 110.0, 105.0])
+    first = mpc.make_step(x)
+    iterations = mpc.stats["iterations"]
+    again = mpc.make_step(x)
+    np.testing.assert_allclose(again, first, atol=1e-3 * (mpc.plant.U_HIGH - mpc.plant.U_LOW).min())
+    assert mpc.stats["iterations"] < iterations / 2
+    compared = mpc.x_compared
+    mpc.make_step(x + 1e-4 * mpc.x_scale)
+    assert mpc.x_compared is compared
+    mpc.make_step(x + 2e-3 * mpc.x_scale)  # moved: the shifted plan and the actor's rollout are compared again
+    assert mpc.x_compared is not compared
 
 
 def test_hessian_sees_the_curvature_of_sines_and_cosines(tmp_path):
