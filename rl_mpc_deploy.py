@@ -329,8 +329,8 @@ class TaylorValue:
     the box of initial states, is projected: negative eigenvalues become zero.
     """
 
-    def __init__(self, expansion, goal, scale):
-        self.expansion, self.goal, self.scale, n = expansion, goal, scale, len(scale)
+    def __init__(self, V, expansion, goal, scale):
+        self.V, self.expansion, self.goal, self.scale, n = V, expansion, goal, scale, len(scale)
         x, theta = ca.MX.sym("x", n), ca.MX.sym("theta", 1 + 2 * n + n**2)
         # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
         center, v, slope, curvature = ca.vertsplit(theta, np.cumsum([0, n, 1, n, n**2]).tolist())
@@ -338,10 +338,13 @@ class TaylorValue:
         cost = v + ca.dot(slope, dx) + ca.bilin(ca.reshape(curvature, n, n), dx, dx) / 2
         self.cost = ca.Function("taylor", [x, theta], [cost])
 
-    def parameters(self, x):
-        """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points)."""
+    def parameters(self, x, order=2):
+        """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points); of order 0: V there, held."""
         columns = []
         for point in x.T:
+            if order == 0:
+                columns.append(np.concatenate([point, [-float(self.V(point, self.goal))], np.zeros(len(point) * (1 + len(point)))]))
+                continue
             v, gradient, hessian = (np.array(value) for value in self.expansion(point, self.goal))
             eigenvalues, vectors = np.linalg.eigh(-hessian * np.outer(self.scale, self.scale))
             projected = vectors * np.maximum(eigenvalues, 0) @ vectors.T
@@ -587,14 +590,14 @@ class ScenarioMPC:
                 self.block(bounds[bound], "box", t)[p == 0] = no_bound
         return bounds
 
-    def _expand(self, w):
+    def _expand(self, w, order=2):
         """With a Taylor value and no fixed point to expand at: expand where each scenario of w ends."""
         if self.taylor is not None and self.expand_at is None:
-            self.theta = self.taylor.parameters(self.physical(w, "x", self.horizon))
+            self.theta = self.taylor.parameters(self.physical(w, "x", self.horizon), order)
 
     def _cost(self, x0, w):
         """Objective of a plan with its dynamics satisfied; a hard bound is dear in this comparison."""
-        self._expand(w)
+        self._expand(w, order=0)
         return self.objective(w, self._parameters(x0, np.minimum(self.slack_price, 1e3)))
 
     def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
@@ -735,7 +738,7 @@ def build_controller(name, args):
             learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
-            learned = dict(actor=mu, taylor=TaylorValue(expansion, goal, critic.scaling["x_scale"]), expand_at=point)
+            learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
         mpc.expansion = expansion

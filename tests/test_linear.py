@@ -301,7 +301,7 @@ def quadratic_taylor(S, b, c, scale):
     x, goal = ca.MX.sym("x", len(c)), ca.MX.sym("goal", len(c))
     V = ca.Function("V", [x, goal], [3.0 + ca.dot(b, x - c) - ca.bilin(ca.DM(S), x - c, x - c)])
     expansion = ca.Function("E", [x, goal], [V(x, goal), ca.gradient(V(x, goal), x), ca.hessian(V(x, goal), x)[0]])
-    return V, deploy.TaylorValue(expansion, np.zeros(len(c)), scale)
+    return V, deploy.TaylorValue(V, expansion, np.zeros(len(c)), scale)
 
 
 def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equal():
@@ -312,6 +312,8 @@ def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equ
     for center in rng.normal(size=(3, 4, 1)):
         theta = np.repeat(taylor.parameters(center), 6, axis=1)
         np.testing.assert_allclose(np.array(taylor.cost.map(6)(x, theta)), -np.array(V.map(6)(x, np.zeros((4, 6)))), rtol=1e-9)
+        np.testing.assert_allclose(taylor.parameters(center, order=0)[:5], theta[:5, :1], rtol=1e-9)
+        assert not taylor.parameters(center, order=0)[5:].any()
     xs, g = ca.MX.sym("x", 4), ca.MX.sym("goal", 4)
     stage, minus_v = ca.Function("s", [xs, g], [-ca.exp(-ca.sumsqr(xs))]), ca.Function("t", [xs, g], [-V(xs, g)])
     actions = []
