@@ -255,10 +255,12 @@ def plot_profile(args):
           f"{'first 5':>9s}{'worst':>8s}{'failed':>8s}")  # fmt: skip
     for label, (colour, dashes, _) in CONTROLLERS.items():
         mine = {key: np.array([row[key] for row in curves if row["controller"] == label]).astype(float) for key in list(curves[0])[1:]}
-        for ax, key in zip(axes, ("norm", "ms")):
+        for ax, key, floor in zip(axes, ("norm", "ms"), (1e-3, 0)):
             if key == "norm" or "actor" not in label:
-                ax.plot(mine["step"], mine[f"{key}_median"], color=colour, ls=dashes, lw=2, label=label)
-                ax.fill_between(mine["step"], mine[f"{key}_low"], mine[f"{key}_high"], color=colour, alpha=0.12, lw=0)
+                low, median, high = (np.maximum(mine[f"{key}_{name}"], floor) for name in ("low", "median", "high"))
+                width = 4.5 if label == "goal-conditioned MPC, no value" and key == "norm" else 2  # on which the others lie
+                ax.plot(mine["step"], median, color=colour, ls=dashes, lw=width, label=label)
+                ax.fill_between(mine["step"], low, high, color=colour, alpha=0.12, lw=0)
         mine = {key: np.array([float(row[key]) for row in rows if row["controller"] == label]) for key in list(rows[0])[7:]}
         baseline[label] = {key: np.median(values) for key, values in mine.items()}
         spread = "".join(
@@ -277,7 +279,7 @@ def plot_profile(args):
     for label in list(CONTROLLERS)[1:]:
         gain = actor - paired(rows, label)
         print(f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}")
-    axes[0].set(ylabel="|x|", yscale="log", xlim=(0, 30))
+    axes[0].set(ylabel="|x|, below 0.001 drawn there", yscale="log", xlim=(0, 12))
     axes[1].set(ylabel="solve time [ms]", yscale="log", xlabel="step")
     axes[0].set_title(f"{len(mine['l2_error'])} systems and starts; lines: medians, bands: 2.5 to 95 percentile", fontsize=10)
     for ax in axes:
@@ -311,15 +313,15 @@ def plot_distance(args):
     fig, axes = plt.subplots(1, len(horizons), figsize=(10, 3.6), sharey=True, layout="constrained", squeeze=False)
     print(f"median steps not near the origin, failed solves of all; starts in a box of half-width {', '.join(scales)}")
     for ax, horizon in zip(axes[0], horizons):
-        for label in labels:
+        for offset, label in zip(np.linspace(-0.2, 0.2, len(labels)), labels):
             colour, dashes, _ = CONTROLLERS[label]
             mine = [row for row in rows if row["controller"] == label and (row["horizon"] == horizon or "actor" in label)]
             steps = [np.median([float(row["steps_not_near"]) for row in mine if row["scale"] == scale]) for scale in scales]
-            ax.plot(range(len(scales)), steps, marker="o", color=colour, ls=dashes, lw=2, label=label)
+            ax.plot(np.arange(len(scales)) + offset, steps, marker="o", color=colour, ls=dashes, lw=1.5, label=label)
             failed = [sum(int(float(row["solver_failures"])) for row in mine if row["scale"] == scale) for scale in scales]
             print(f"N = {horizon:3s} {label:42s}" + "".join(f"{s:9.2f} ({f:4d})" for s, f in zip(steps, failed)))
         ax.set_xticks(range(len(scales)), scales)
-        ax.set(title=f"N = {horizon}", yscale="log", xlabel="half-width of the start box")
+        ax.set(title=f"N = {horizon}", ylim=(-0.3, None), xlabel="half-width of the start box")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("steps not near the origin")
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
