@@ -955,7 +955,8 @@ def main(args):
     except RuntimeError as error:
         fail(error)
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}")
-    print("building the controllers; new ones are compiled, which takes half a minute", flush=True)
+    if args.compile and not hasattr(plant, "next_state"):
+        print("building the controllers; new ones are compiled, which takes half a minute", flush=True)
     tick = time.perf_counter()
     rows, paths = compare(args)
     with open(out / "results.csv", "w", newline="") as file:

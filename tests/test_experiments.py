@@ -118,3 +118,6 @@ def test_shipped_critics_are_the_first_seed_of_the_committed_table():
         row = next(row for row in table if row["scenarios"] == scenarios and row["seed"] == "0")
         text = (ROOT / f"experiments/pretrained/cstr_{scenarios}.txt").read_text()
         assert f"{float(row['robust_median_ape']):.2f} %" in text and f"{float(row['nominal_median_ape']):.2f} %" in text
+    first = next(csv.DictReader(open(ROOT / "experiments/results/linear_value_mpc_training.csv")))
+    text = (ROOT / "experiments/pretrained/linear_robust.txt").read_text()
+    assert (first["n"], first["system"]) == ("32", "0") and f"{float(first['error_median']):.2f} %" in text

@@ -401,6 +401,20 @@ def test_default_networks_are_the_papers():
     assert training.Args().hidden == (64, 64) and training.Args(hidden=(8,), env="linear").hidden == (8,)
 
 
+def test_the_shipped_critic_holds_the_origin_and_beats_its_actor():
+    """32 states; the closed loops of the actor and of the planner with its value, exact and expanded, from one start."""
+    path, reached = ROOT / "experiments/pretrained/linear_robust.pt", {}
+    for name, value in (("actor", "exact"), ("rl_mpc", "exact"), ("rl_mpc", "taylor"), ("rl_mpc", "taylor-local")):
+        controller = deploy.build_controller(name, deploy.Args(env="linear", critic=path, horizon=2, value=value))
+        x = np.random.default_rng(0).uniform(-1, 1, size=32)
+        for _ in range(6):
+            x = controller.plant.step(x, controller.make_step(x))
+            assert controller.stats["rung"] == "solved"
+        reached[name, value] = np.linalg.norm(x)
+    assert 0.01 < reached.pop(("actor", "exact")) < 0.05
+    assert max(reached.values()) < 0.01
+
+
 # Command line
 
 
