@@ -62,9 +62,10 @@ class Args:
     control_horizon: int | None = None
     """N_c, from which stage on the actions follow the plant's linear feedback (linear: the LQR's); default: never"""
     gamma: float = 1.0
-    """discount inside the plan"""
+    """discount inside the plan, and of the linear-quadratic value and feedback"""
     sigma2: float | None = None
-    """sigma^2 of the Gaussian of --objective goal, squared units of the goal error; default: the plant's (1, 0.01; linear 0.5)"""
+    """sigma^2 of the Gaussian of --objective goal, squared units of the goal error; default: the plant's (double_pendulum 1, cstr 0.01,
+    linear 0.5)"""
     goal: tuple[str, ...] = ()
     """a name (double_pendulum: up-up, up-down, down-up) or numbers joined by commas; @STEP after it: from that step on.
     Default: the plant's evaluation goal"""
@@ -97,7 +98,8 @@ class Args:
     solver: Literal["ipopt", "fatrop"] = "ipopt"
     """fatrop: faster on long horizons, fails more often; nominal problems (--robust-horizon 0) only"""
     guide_horizon: int = 0
-    """horizon of a controller whose simulated closed loop is the first guess; 0: the start state held. Helps from N = 100 on"""
+    """horizon of a controller whose simulated closed loop is the first guess; 0: the start state held (linear: the regulator's
+    closed loop). Helps from N = 100 on"""
     compile: bool = True
     """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc); linear plants are never compiled, since
     matrix products gain nothing"""
@@ -493,7 +495,8 @@ def goal_schedule(plant, texts, steps):
             allowed = ", ".join(named) + " or " * bool(named) + f"{len(plant.EVAL_GOAL)} number(s) joined by commas"
             raise ValueError(f"--goal {text} is not a goal of {plant.ENV_ID}; it must be {allowed}")
         if not ((plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
-            raise ValueError(f"--goal {text} is out of range; it must lie in {plant.GOAL_LOW} to {plant.GOAL_HIGH}")
+            low, high = (np.array2string(bound, threshold=4, edgeitems=1) for bound in (plant.GOAL_LOW, plant.GOAL_HIGH))
+            raise ValueError(f"--goal {text} is out of range; it must lie in {low} to {high}")
         if first < 0 and not when:
             start = 0
         if not (first < start < steps and (first >= 0 or start == 0)):
@@ -508,7 +511,8 @@ def costs(plant, objective, sigma2=None, gamma=1.0):
     A plant with a linear-quadratic regulator has costs l(x, u) and V(x) = x'Px; its objective goal is that of eq:jensen, -exp(-l) and
     -exp(-V) at the default sigma^2 = 1/2.
     """
-    x, u, goal = (ca.SX.sym(name, n) for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX))))
+    sym = ca.MX.sym if hasattr(plant, "lqr") else ca.SX.sym  # matrix products stay matrix products
+    x, u, goal = (sym(name, n) for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX))))
     sigma2 = plant.MPC_SIGMA2 if sigma2 is None else sigma2
 
     def shaped(cost):
@@ -659,7 +663,7 @@ def figure(plant, x, u, goals, path):
     axes[-1, 0].set_xlim(0, time_axis[-1])
     axes[-1, 0].set_xlabel(f"time [{plant.TIME_UNIT}]")
     handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
-    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
+    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -685,8 +689,10 @@ def check(args):
         goals = goal_schedule(plant, args.goal, args.steps)
     except ValueError as error:
         fail(error)
-    if args.control_horizon is not None and not (hasattr(plant, "lqr") and 0 <= args.control_horizon <= args.horizon):
-        fail(f"--control-horizon is {args.control_horizon}; it needs a plant with a linear feedback and 0 to --horizon {args.horizon}")
+    if args.control_horizon is not None and not hasattr(plant, "lqr"):
+        fail(f"--control-horizon is {args.control_horizon}, but {args.env} has no linear feedback to follow beyond it")
+    if args.control_horizon is not None and not 0 <= args.control_horizon <= args.horizon:
+        fail(f"--control-horizon is {args.control_horizon}; it must lie in 0 to --horizon {args.horizon}")
     if args.discretization == "radau" and hasattr(plant, "next_state"):
         fail(f"--discretization radau needs a differential equation; {args.env} is a discrete-time plant")
     if args.scenarios not in plant.SCENARIOS:
@@ -698,9 +704,8 @@ def check(args):
         fail(f"--guide-horizon is {args.guide_horizon}; it must be below --horizon {args.horizon}")
     if args.objective == "expert" and (goals != plant.EVAL_GOAL).any():
         fail(f"--objective expert knows the goal {plant.EVAL_GOAL} only; give --goal to --objective goal or quadratic")
-    if (goals < plant.GOAL_REACHABLE[0]).any() or (goals > plant.GOAL_REACHABLE[1]).any():
-        low, high = plant.GOAL_REACHABLE
-        print(f"warning: --goal {' '.join(args.goal)} leaves {low} to {high}, where every scenario can hold it", file=sys.stderr)
+    if not envs.can_hold(plant, goals).all():
+        print(f"warning: --goal {' '.join(args.goal)} is not a goal that every scenario can hold", file=sys.stderr)
     if args.solver == "fatrop" and args.robust_horizon:
         fail(f"--solver fatrop solves nominal problems only; --robust-horizon is {args.robust_horizon}, it must be 0")
     weights = args.change_weight

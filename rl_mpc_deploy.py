@@ -58,7 +58,7 @@ DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
 @dataclass(frozen=True)
 class Args:
     env: str = "cstr"
-    """the plant: NAME of a module envs/NAME.py; must be the one that the critic was trained on"""
+    """the plant: NAME of a module envs/NAME.py; must be the one that the critic was trained on, whose checkpoint also names its size"""
     horizon: int = 5
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
     critic: Path | None = None
@@ -408,6 +408,8 @@ class ScenarioMPC:
         self.scenarios = np.asarray(scenarios if robust_horizon else scenarios[:1])
         self.stage_cost, self.terminal_cost, self.taylor, self.expand_at = stage_cost, terminal_cost, taylor, expand_at
         self.goal = np.array(goal, dtype=float)
+        if self.goal.shape != (len(plant.GOAL_INDEX),):
+            raise ValueError(f"goal has shape {self.goal.shape}; {plant.ENV_ID} needs ({len(plant.GOAL_INDEX)},)")
         self.n_x, self.n_u = len(plant.X_LOW), len(plant.U_LOW)
         self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
         self.relaxed_price = relaxed_price
@@ -826,7 +828,9 @@ def run_job(name, args, episode):
 
 def compare(args):
     """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
-    names, found = dict.fromkeys(args.controllers), {}
+    names, found = list(dict.fromkeys(args.controllers)), {}
+    if len(load_critic(critic_path(args), args.env).plant.SCENARIOS["mpc"]) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):
+        names.remove("robust_mpc")  # the same controller
     quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
     pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"), **quit_at_once)  # torch does not survive a fork
     try:
@@ -898,10 +902,15 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
         if i in plant.GOAL_INDEX:
             ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
         ax.set_title(titles[i], fontsize=10)
-    for ax in axes[-1]:
+    for ax in axes.ravel()[len(shown) :]:
+        ax.set_visible(False)
+    for ax in axes.ravel()[max(len(shown) - 3, 0) : len(shown)]:
+        ax.xaxis.set_tick_params(labelbottom=True)
         ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
+    if len(shown) < len(low):
+        axes[0, 0].set_title(f"{titles[0]} (4 of {len(plant.X_LOW)} states)", fontsize=10)
     handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
-    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
+    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -921,6 +930,8 @@ def check(args):
     for name, (least, most) in ranges.items():
         if getattr(args, name) is not None and not least <= getattr(args, name) <= most:  # catches nan too
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{least:g}, {most:g}]")
+    if args.horizon == 0 and "goal_mpc" in args.controllers:
+        fail("--horizon is 0; --controllers goal_mpc plans, so that it must be at least 1")
     if not args.controllers:
         fail(f"--controllers is empty; choose from {', '.join(LABELS)}")
     if args.critic is None and not critic_path(args).exists():
@@ -935,10 +946,10 @@ def check(args):
         fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal)
     if goal.shape != plant.EVAL_GOAL.shape or not ((plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
-        fail(f"--goal is {args.goal}; it needs {len(plant.GOAL_LOW)} number(s) in {plant.GOAL_LOW} to {plant.GOAL_HIGH}")
-    low, high = plant.GOAL_REACHABLE
-    if ((goal < low) | (goal > high)).any():
-        print(f"warning: --goal {args.goal} is outside [{low[0]:g}, {high[0]:g}], where every scenario can hold it", file=sys.stderr)
+        low, high = (np.array2string(bound, threshold=4, edgeitems=1) for bound in (plant.GOAL_LOW, plant.GOAL_HIGH))
+        fail(f"--goal is {args.goal}; it needs {len(plant.GOAL_LOW)} number(s) in {low} to {high}")
+    if not envs.can_hold(plant, goal):
+        print(f"warning: --goal {args.goal} is not a goal that every scenario can hold", file=sys.stderr)
     return plant, goal, critic
 
 

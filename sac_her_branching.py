@@ -56,9 +56,9 @@ class Args:
     seed: int = 0
     """seed of networks, plants, exploration and replay; same seed, same machine, same numbers"""
     total_timesteps: int | None = None
-    """transitions to collect, over all parallel plants; default: the plant's (cstr: 100000)"""
+    """transitions to collect, over all parallel plants; default: the plant's (cstr: 100000, linear: 500000)"""
     num_envs: int | None = None
-    """plants simulated in parallel; default: the plant's (cstr: 32)"""
+    """plants simulated in parallel; default: the plant's (cstr: 32, linear: 64)"""
     scenarios: Literal["robust", "nominal", "mpc"] = "robust"
     """where psi is drawn from at every step: the training grid, the nominal plant, or the MPC's scenario set"""
     branches: int = 1
@@ -84,9 +84,9 @@ class Args:
     """what the networks see beside the state: goal minus achieved goal, or the goal itself"""
 
     hidden: tuple[int, ...] | None = None
-    """widths of the hidden layers of actor and critics (SiLU); default: the plant's (cstr: 64 64)"""
+    """widths of the hidden layers of actor and critics (SiLU); default: the plant's (cstr: 64 64, linear: 256 256)"""
     gamma: float | None = None
-    """discount; default: the plant's (cstr: 0.99)"""
+    """discount; default: the plant's (cstr: 0.99, linear: 0.9)"""
     tau: float = 0.02
     """step of the target networks towards the critics after each update"""
     batch_size: int = 256
@@ -96,9 +96,10 @@ class Args:
     learning_rate_end: float = 0.0
     """learning rate at the end of the run, as a share of the initial one (it falls linearly)"""
     learning_starts: int | None = None
-    """transitions with uniformly random actions before the first update; default: the plant's (cstr: 1000)"""
+    """transitions with uniformly random actions before the first update; default: the plant's (cstr: 1000,
+    linear: 10000)"""
     steps_per_update: int | None = None
-    """transitions collected per update; default: the plant's (cstr: 8)"""
+    """transitions collected per update; default: the plant's (cstr: 8, linear: 16)"""
     entropy_in_target: bool = True
     """SAC's soft value; off: the critic counts reward alone, the actor still maximises Q plus entropy"""
     buffer_size: int | None = None
@@ -106,7 +107,7 @@ class Args:
     target_entropy: float | None = None
     """entropy that the coefficient alpha is tuned to; default: the plant's (cstr: minus the number of actions)"""
     alpha_init: float | None = None
-    """entropy coefficient at the start; default: the plant's (cstr: 1)"""
+    """entropy coefficient at the start; default: the plant's (cstr: 1, linear: 0.005)"""
 
     eval_every: int = 10_000
     """transitions between evaluations; 0: only at the end"""
@@ -504,12 +505,13 @@ def check(args):
             value = getattr(args, name)
             if value is not None and not low <= value <= high:  # catches nan too
                 fail(f"--{name.replace('_', '-')} is {value}; it must lie in [{low:g}, {high:g}]")
-    if not args.hidden or min(args.hidden) < 1:
-        fail(f"--hidden is {args.hidden}; it needs at least one width, each at least 1")
+    if not args.hidden or not all(1 <= width <= 10_000 for width in args.hidden):
+        fail(f"--hidden is {args.hidden}; it needs at least one width, each from 1 to 10000")
     if args.buffer_size < args.num_envs:
         fail(f"--buffer-size is {args.buffer_size}; it must hold at least one transition of each of the {args.num_envs} plants")
-    if args.buffer_size > 10**8:
-        fail(f"--buffer-size is {args.buffer_size}; at most 100000000 transitions are allowed")
+    size = len(plant.X_LOW) * (2 + (args.branches if args.branches > 1 else 0)) + len(plant.U_LOW) + len(plant.GOAL_INDEX) + 4
+    if args.buffer_size > 10**10 // (4 * size):
+        fail(f"--buffer-size is {args.buffer_size}; at most {10**10 // (4 * size)} transitions are allowed, ten gigabytes")
     if args.device == "cuda" and not torch.cuda.is_available():
         fail("--device is cuda, but torch finds no CUDA device here; use auto or cpu")
     return plant
@@ -632,7 +634,7 @@ def main(args):
     last, goal = rows[-1], np.array2string(plant.EVAL_GOAL, threshold=4, edgeitems=1)
     print(f"""
 {plant.ENV_ID}, {args.scenarios} scenarios, seed {args.seed}: {step} transitions, {updates} updates in {seconds:.0f} s
-absolute percentage error, goal {goal}   median   75th percentile
+error in percent, goal {goal}        median   75th percentile
   robust evaluation, all plants      {last["robust_median_ape"]:10.2f} {last["robust_p75_ape"]:12.2f}
   robust evaluation, held-out plants {last["robust_held_out_median_ape"]:10.2f}
   nominal evaluation                 {last["nominal_median_ape"]:10.2f} {last["nominal_p75_ape"]:12.2f}

@@ -101,6 +101,15 @@ def outside_constraints(plant, x, sigma2=0.01, xp=np):
     return xp.exp(-((x - xp.clip(x, low, high)) ** 2).sum(-1) / (2 * sigma2)) - 1
 
 
+def can_hold(plant, goals):
+    """Whether every scenario can hold each goal at steady state, (..., n_goal) -> (...)."""
+    if hasattr(plant, "held_action"):
+        action = np.apply_along_axis(plant.held_action, -1, np.asarray(goals))
+        return ((plant.U_LOW <= action) & (action <= plant.U_HIGH)).all(-1)
+    low, high = plant.GOAL_REACHABLE
+    return ((low <= goals) & (goals <= high)).all(-1)
+
+
 def checked_state(plant, x0):
     """The measured state as a float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
     x0 = np.asarray(x0, dtype=float)

@@ -87,7 +87,7 @@ class Linear:
         self.TRAIN_GOALS = rng.uniform(0, 1, size=(1000, 1)) * rng.uniform(-1, 1, size=(1000, n))
         self.GOAL_LOW, self.GOAL_HIGH = -one, one
         held = 1 / np.abs(np.eye(n) - a).sum(axis=1)  # a goal is held by u = (I - A) g
-        self.GOAL_REACHABLE = -held.min() * one, held.min() * one
+        self.GOAL_REACHABLE = -held.min() * one, held.min() * one  # a cube within the goals that envs.can_hold tells exactly
         self.ERROR_SCALE = one
         self.lqr = cache(self._lqr)
 
@@ -138,6 +138,7 @@ class Linear:
 @cache
 def make(dim=2, system=0):
     """The plant of dimension `dim` whose matrix is drawn from the seed `system`. Raises ValueError for a size that is not one."""
-    if not (1 <= dim <= 512 and 0 <= system <= 10**9):
-        raise ValueError(f"--dim is {dim} and --system {system}; they must lie in 1 to 512 and 0 to 1000000000")
+    for name, value, least, most in (("dim", dim, 1, 512), ("system", system, 0, 10**9)):
+        if not (isinstance(value, (int, np.integer)) and least <= value <= most):
+            raise ValueError(f"--{name} is {value}; it must be a whole number from {least} to {most}")
     return Linear(*random_matrix(dim, np.random.default_rng([dim, system])))

@@ -4,10 +4,40 @@ import csv
 import hashlib
 import os
 import signal
+import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from tqdm import tqdm
+
+
+def fail(message):
+    """A user's mistake: one sentence, exit code 2, no traceback."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def check(args, table, **ranges):
+    """Refuse arguments outside their (least, most), a folder that cannot be written, and redrawing `table` where there is none."""
+    for name, (least, most) in ranges.items():
+        if not (getattr(args, name) is None or least <= getattr(args, name) <= most):
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in {least} to {most}")
+    for name in ("out",) if args.plot_only else ("runs", "out"):
+        try:
+            getattr(args, name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            fail(f"--{name} {getattr(args, name)}: cannot write there ({error.strerror})")
+    if args.plot_only and not (args.out / "results" / table).exists():
+        fail(f"--plot-only: {args.out / 'results' / table} does not exist; run without it first")
+
+
+def run(main, args):
+    """`main(args)`; Ctrl-C ends it without a traceback."""
+    try:
+        main(args)
+    except KeyboardInterrupt:
+        print("interrupted; what is finished is kept, so that the same command continues", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def read(path):

@@ -98,7 +98,7 @@ def collect(args):
         if not path.exists():
             print(variant)
             write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)
-        rows += read(path)
+        rows += [row | {"variant": variant} for row in read(path)]  # studies that share a variant name it differently
     write(rows, args.out / f"results/cstr_{args.study}.csv")
 
 

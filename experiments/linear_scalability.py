@@ -180,10 +180,9 @@ def settings_of(args):
     """Variants, dimensions, systems and starts of a study."""
     if args.quick:
         variants = {"base": {}} if args.study == "main" else {"base": {}, "control horizon 5": SWEEP["control horizon 5"]}
-        return variants, (2, 4), args.systems or 2, args.starts or 2
-    if args.study == "main":
-        return {"base": {}}, DIMENSIONS, args.systems or 10, args.starts or 10
-    return SWEEP, (2, 8, 32), args.systems or 5, args.starts or 4
+        return variants, (2, 4), 2, 2
+    variants, dimensions, systems, starts = ({"base": {}}, DIMENSIONS, 10, 10) if args.study == "main" else (SWEEP, (2, 8, 32), 5, 4)
+    return variants, dimensions, systems if args.systems is None else args.systems, starts if args.starts is None else args.starts
 
 
 def collect(args):
@@ -272,7 +271,8 @@ def plot_main(args):
 def plot_sweep(args):
     rows = cells.read(args.out / "results/linear_scalability_sweep.csv")
     variants, dimensions = list(dict.fromkeys(row["variant"] for row in rows)), sorted({int(row["n"]) for row in rows})
-    fig, axes = plt.subplots(1, 3, figsize=(10, 1.2 + 0.32 * len(variants)), sharey=True, layout="constrained")
+    size = (2 + 2.7 * len(dimensions), 1.4 + 0.32 * len(variants))
+    fig, axes = plt.subplots(1, len(dimensions), figsize=size, sharey=True, layout="constrained")
     print(
         f"{'':26s}"
         + "".join(f"{'n = ' + str(n):>30s}" for n in dimensions)
@@ -295,15 +295,18 @@ def plot_sweep(args):
         ax.set(title=f"n = {n}", xlabel="steps not near the origin")
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(-np.arange(len(variants)), variants)
+    axes[0].set_ylim(0.5 - len(variants), 0.5)
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
     save(fig, args.out / "figures/linear_scalability_sweep.png")
 
 
 def main(args):
+    table = f"linear_scalability{'' if args.study == 'main' else '_sweep'}.csv"
+    cells.check(args, table, systems=(1, 1000), starts=(1, 1000), jobs=(1, 1024), seed=(0, 10**9))
     if not args.plot_only:
         collect(args)
     (plot_main if args.study == "main" else plot_sweep)(args)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -89,14 +89,16 @@ class Args:
 
 
 def agent_folder(args, dim, system):
-    return args.runs / f"agents/{dim}_{system}{'_quick' if args.quick else ''}"
+    """Agents of the scaling study have a smaller budget and a folder of their own."""
+    return args.runs / f"agents/{dim}_{system}{'' if dim == args.dim else '_scaling'}{'_quick' if args.quick else ''}"
 
 
 def checkpoint(args, dim, system):
     """The trained agent of a system; a missing one is a user's mistake."""
     found = list(agent_folder(args, dim, system).glob("*/wall_seconds.txt"))
     if not found:
-        deploy.fail(f"no agent for system {system} in {args.runs}: run python experiments/linear_value_mpc.py --study train first")
+        command = f"python experiments/linear_value_mpc.py --study train --dim {args.dim} --systems {args.systems} --runs {args.runs}"
+        cells.fail(f"no trained agent in {agent_folder(args, dim, system)}; first run {command}{' --quick' if args.quick else ''}")
     return found[0].parent / "checkpoint.pt"
 
 
@@ -238,7 +240,7 @@ def profile(args):
             curve = dict(zip(("norm_low", "norm_median", "norm_high"), np.quantile(norms[:, t], [0.025, 0.5, 0.95])))
             late = np.minimum(t, times.shape[1] - 1)  # no action is computed at the last state: its time is repeated
             curve |= dict(zip(("ms_low", "ms_median", "ms_high"), np.quantile(times[:, late], [0.025, 0.5, 0.95])))
-            curves.append({"controller": label, "step": t} | {k: round(float(v), 6) for k, v in curve.items()})
+            curves.append({"controller": label, "step": t} | {k: float(f"{v:.5g}") for k, v in curve.items()})
     cells.write(curves, args.out / "results/linear_value_mpc_profile.csv")
 
 
@@ -363,7 +365,7 @@ def plot_scaling(args):
             print(f"  {label:42s}" + "".join(f"{b:8.1f} ({a:7.1f})" for a, b in zip(early, late)))
         ax.set(xscale="log", yscale="log", xlabel={"n": "number of states n", "horizon": "horizon N"}[axis])
         ax.set_xticks(values, values)
-        ax.minorticks_off()
+        ax.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("solve time, mean of steps 1 to 5 [ms]")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
@@ -371,6 +373,9 @@ def plot_scaling(args):
 
 
 def main(args):
+    table = {"train": "training", "profile": "profile", "distance": "distance", "scaling": "times"}[args.study]
+    cells.check(args, f"linear_value_mpc_{table}.csv", dim=(1, 512), systems=(1, 1000), starts=(1, 1000), steps=(5, 10**6),
+                horizon=(1, 1000), jobs=(1, 1024), seed=(0, 10**9))  # fmt: skip
     if args.quick:
         args = replace(args, dim=3, systems=2, starts=2, steps=5)
     if args.study == "train":
@@ -381,4 +386,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -94,6 +94,24 @@ def test_agents_are_needed_before_their_closed_loops(tmp_path):
     assert out.returncode == 2 and "--study train" in out.stderr and "Traceback" not in out.stderr
 
 
+@pytest.mark.parametrize(
+    "name, arguments, words",
+    [
+        ("linear_scalability", ["--jobs", "0"], ["--jobs", "0"]),
+        ("linear_scalability", ["--systems", "0"], ["--systems", "0"]),
+        ("linear_value_mpc", ["--horizon", "0"], ["--horizon", "0"]),
+        ("linear_value_mpc", ["--study", "train", "--dim", "600"], ["--dim", "600"]),
+        ("linear_value_mpc", ["--plot-only", "--out", "{}"], ["--plot-only", "does not exist"]),
+        ("linear_value_mpc", ["--out", "README.md/x"], ["--out", "cannot write"]),
+    ],
+)
+def test_bad_arguments_get_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
+    command = [sys.executable, f"experiments/{name}.py", "--runs", str(tmp_path), *(a.format(tmp_path) for a in arguments)]
+    out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert out.returncode == 2 and "Traceback" not in out.stderr
+    assert all(word in out.stderr for word in words), out.stderr
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_figures_are_drawn_from_the_committed_tables(name, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
