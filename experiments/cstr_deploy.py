@@ -10,7 +10,6 @@ Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc
 studies write cstr_value and cstr_expansion.
 """
 
-import csv
 import hashlib
 import sys
 from dataclasses import dataclass
@@ -26,6 +25,8 @@ import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+import cells
+
 import rl_mpc_deploy as deploy
 
 PRETRAINED = HERE / "pretrained"
@@ -74,19 +75,6 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def read(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write(rows, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def collect(args):
     episodes, steps = (2, 10) if args.quick else (args.episodes, 100)
     rows = []
@@ -97,13 +85,13 @@ def collect(args):
         path = args.runs / f"{version}.csv"  # another script, plant, critic or setting is another file
         if not path.exists():
             print(variant)
-            write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)
-        rows += [row | {"variant": variant} for row in read(path)]  # studies that share a variant name it differently
-    write(rows, args.out / f"results/cstr_{args.study}.csv")
+            cells.write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)
+        rows += [row | {"variant": variant} for row in cells.read(path)]  # studies that share a variant name it differently
+    cells.write(rows, args.out / f"results/cstr_{args.study}.csv")
 
 
 def plot(args):
-    variants, rows = STUDIES[args.study], read(args.out / f"results/cstr_{args.study}.csv")
+    variants, rows = STUDIES[args.study], cells.read(args.out / f"results/cstr_{args.study}.csv")
     columns = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
     fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.45 * len(variants)), sharey=True, layout="constrained")
     print(f"{'':33s}{'time near goal':>27s}{'time outside constraints':>39s}{'offset':>9s}{'solve ms':>16s}{'failed':>9s}")

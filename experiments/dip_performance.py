@@ -7,7 +7,6 @@ The first guess is the start state held, as in the authors' scripts, or (guide 7
 N = 75. Writes results/dip_performance.csv (a row per controller and start, columns of goal_mpc.py) and figures/dip_performance.png.
 """
 
-import csv
 import hashlib
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +23,8 @@ import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+import cells
+
 import goal_mpc as gm
 from envs import double_pendulum
 
@@ -54,11 +55,6 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def read(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def run_cell(settings, path):
     """One controller from every start; rows of results.csv with the guide's horizon, into `path`."""
     mpc, goals, rows = gm.build_controller(settings), np.zeros((settings.steps, 2)), []
@@ -84,11 +80,11 @@ def collect(args):
                 futures.append(pool.submit(run_cell, settings, paths[-1]))
         for future in tqdm(futures, unit="cell", disable=None):
             future.result()
-    gm.write_csv([row for path in paths for row in read(path)], args.out / "results/dip_performance.csv")
+    gm.write_csv([row for path in paths for row in cells.read(path)], args.out / "results/dip_performance.csv")
 
 
 def plot(args):
-    rows = read(args.out / "results/dip_performance.csv")
+    rows = cells.read(args.out / "results/dip_performance.csv")
     panels = {"time_near_goal": "time near goal [steps]", "action_total_variation": "action total variation [N]"}
     columns = list(dict.fromkeys((row["horizon"], row["guide_horizon"]) for row in rows))
     variation = {}  # (objective, column): median

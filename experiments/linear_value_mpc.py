@@ -283,7 +283,8 @@ def plot_profile(args):
         print(f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}")
     axes[0].set(ylabel="|x|, below 0.001 drawn there", yscale="log", xlim=(0, 12))
     axes[1].set(ylabel="solve time [ms]", yscale="log", xlabel="step")
-    axes[0].set_title(f"{len(mine['l2_error'])} systems and starts; lines: medians, bands: 2.5 to 95 percentile", fontsize=10)
+    systems, starts = (len({row[key] for row in rows}) for key in ("system", "start"))
+    axes[0].set_title(f"{systems} systems, {starts} starts each; lines: medians, bands: 2.5 to 95 percentile", fontsize=10)
     for ax in axes:
         ax.grid(alpha=0.3)
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
