@@ -123,10 +123,11 @@ def test_the_animation_is_small_enough_for_the_readme():
     assert (ROOT / "experiments/figures/dip_profile.gif").stat().st_size < 2e6
 
 
-def test_study_of_the_values(tmp_path):
+@pytest.mark.parametrize("study", ["value", "expansion"])
+def test_studies_of_the_value(study, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
-    run("cstr_deploy", "--study", "value", "--plot-only", "--out", tmp_path)
-    assert (tmp_path / "figures/cstr_value.png").stat().st_size > 10_000
+    run("cstr_deploy", "--study", study, "--plot-only", "--out", tmp_path)
+    assert (tmp_path / f"figures/cstr_{study}.png").stat().st_size > 10_000
 
 
 def test_shipped_critics_are_the_first_seed_of_the_committed_table():
