@@ -9,7 +9,8 @@
                       share their history; over the robust horizon the paths i take every sequence of scenarios, then each keeps its last
 
 with the stage cost l chosen by `--objective` (the paper's Example 1) from the plant's goal error e, for the pendulum 1 - cos(theta - g):
-goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy.
+goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy. A linear plant has
+l(x_t, u_t) = |x_t|^2 + |u_t|^2 at t = 0 ... N-1 and m(x_N) = x_N'Px_N (eq:nominalMPCobj), goal takes -exp of both (eq:jensen).
 
     python goal_mpc.py --env double_pendulum --objective goal --horizon 75          # swing both rods up and hold them
     python goal_mpc.py --goal up-down down-up@120 --steps 240 --horizon 35 --sigma2 0.5 --animate    # visit two other equilibria
