@@ -830,7 +830,8 @@ def compare(args):
     """Every controller on every draw, over `--jobs` processes. Returns rows and trajectories {controller: (x, u)}, in order."""
     names, found = list(dict.fromkeys(args.controllers)), {}
     if len(load_critic(critic_path(args), args.env).plant.SCENARIOS["mpc"]) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):
-        names.remove("robust_mpc")  # the same controller
+        names.remove("robust_mpc")
+        print("notice: robust MPC is left out, since with a single scenario it is nominal MPC", file=sys.stderr)
     quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
     pool = ProcessPoolExecutor(args.jobs, mp_context=multiprocessing.get_context("spawn"), **quit_at_once)  # torch does not survive a fork
     try:

@@ -8,6 +8,7 @@ N = 75. Writes results/dip_performance.csv (a row per controller and start, colu
 """
 
 import hashlib
+import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -68,7 +69,8 @@ def run_cell(settings, path):
 
 def collect(args):
     paths = []
-    with ProcessPoolExecutor(args.jobs) as pool:
+    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
+    with ProcessPoolExecutor(args.jobs, **quit_at_once) as pool:
         futures = []
         for objective, horizon, guide in CELLS:
             settings = gm.Args(objective=objective, horizon=horizon, guide_horizon=guide, episodes=args.episodes, seed=args.seed)
