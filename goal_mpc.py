@@ -414,7 +414,7 @@ class ScenarioMPC:
         return self.rollout_guess(x0, action)
 
     def baseline_guess(self, x0):
-        """w with the closed loop under the plant's own feedback: a Gaussian is flat far from the goal, so plans should end near it."""
+        """w with the closed loop under the plant's own feedback, which saves iterations."""
         return self.rollout_guess(x0, lambda t, x: self.plant.baseline(x, self.goal[:, t]))
 
     def cold_guesses(self):
