@@ -93,7 +93,8 @@ class Linear:
 
     def next_state(self, x, u, psi=None, xp=np):
         """A x + B u, components along the first axis: x (n, ...), u (n, ...); xp is numpy, torch or casadi."""
-        return xp.asarray(self.A) @ x + u if xp is not np and not hasattr(xp, "vertcat") else self.A @ x + u
+        a = xp.as_tensor(self.A, dtype=x.dtype, device=x.device) if hasattr(xp, "as_tensor") else self.A
+        return a @ x + u
 
     def step(self, x, u, psi=None, substeps=1):
         """State one sampling time later. Batched over the leading axes: x (..., n), u (..., n) -> (..., n)."""
