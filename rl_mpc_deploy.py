@@ -225,7 +225,8 @@ class Expansion(ca.Callback):
 
     def __init__(self, critic):
         ca.Callback.__init__(self)
-        self.combine, (self.actor, self.twins) = critic.combine, layers(critic)
+        self.combine, (self.actor, twins) = critic.combine, layers(critic)
+        self.twins = twins[:1] if self.combine == "first" else twins
         sizes = (("x", critic.scaling["x_center"].size), ("goal", critic.scaling["goal_center"].size), ("adjoint", critic.network["n_in"]))
         x, goal, adjoint = (ca.MX.sym(*size) for size in sizes)
         self.shapes, z = (x.shape, goal.shape, (x.numel(), x.numel())), critic.features(x, goal, ca)
@@ -283,8 +284,9 @@ class Expansion(ca.Callback):
             d_z += through_actor
             hessian += more + J_mean.T @ (d_action * -2 * action * slope * J_mean) + np.array(self.bend(*arguments, d_z))
             results.append((q, J.T @ d_z, hessian))
-        chosen = {"first": results[:1], "min": [min(results, key=lambda r: r[0])], "mean": results}[self.combine]
-        return [sum(values) / len(chosen) for values in zip(*chosen)]
+        if self.combine == "min":
+            return min(results, key=lambda result: result[0])
+        return [sum(values) / len(results) for values in zip(*results)]
 
 
 def with_derivatives(V, expansion):
