@@ -125,9 +125,10 @@ class TwinCritic(nn.Module):
 
     def forward(self, z, a):
         h = torch.cat([z, a], dim=-1).expand(2, -1, -1)
-        for w, b in zip(self.weight[:-1], self.bias[:-1]):
+        *hidden, (w_out, b_out) = zip(self.weight, self.bias)  # a slice of a ParameterList would make a new module each time
+        for w, b in hidden:
             h = F.silu(torch.baddbmm(b, h, w))
-        return torch.baddbmm(self.bias[-1], h, self.weight[-1]).squeeze(-1)
+        return torch.baddbmm(b_out, h, w_out).squeeze(-1)
 
 
 class Critic:
@@ -400,10 +401,12 @@ class ScenarioMPC:
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
     taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: the state (n_x,) to expand at, or
     None for where each scenario's guess ends.
+    barrier: IPOPT's barrier parameter at the start of a warm solve, or "adaptive" (mu_strategy, of every solve).
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
-                 relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, tol=1e-6, compile=True):  # fmt: skip
+                 relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, barrier=1e-4, tol=1e-6,
+                 compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
@@ -414,7 +417,7 @@ class ScenarioMPC:
             raise ValueError(f"goal has shape {self.goal.shape}; {plant.ENV_ID} needs ({len(plant.GOAL_INDEX)},)")
         self.n_x, self.n_u = len(plant.X_LOW), len(plant.U_LOW)
         self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
-        self.relaxed_price = relaxed_price
+        self.relaxed_price, self.barrier = relaxed_price, barrier
         self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight)
         self.x_center, self.x_scale = (plant.INIT_LOW + plant.INIT_HIGH) / 2, (plant.INIT_HIGH - plant.INIT_LOW) / 2
         self.box = (plant.X_LOW - self.x_center) / self.x_scale, (plant.X_HIGH - self.x_center) / self.x_scale
@@ -510,8 +513,12 @@ class ScenarioMPC:
         """IPOPT twice on the same functions: from scratch, and from a nearby solution with its multipliers."""
         # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost
         common = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 200, "bound_relax_factor": 0.0}
-        warm = {"warm_start_init_point": "yes", "mu_init": 1e-4, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
+        warm = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                 "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
+        if self.barrier == "adaptive":
+            common["mu_strategy"] = "adaptive"
+        else:
+            warm["mu_init"] = self.barrier
 
         def options(name):
             return {"ipopt": common | (warm if name == "warm" else {}), "print_time": False, "show_eval_warnings": False}
@@ -532,6 +539,7 @@ class ScenarioMPC:
         self.plan = None  # (w, lam_x, lam_g) of the last successful solve, shifted by one step after each use
         self.plan_left = 0  # actions that it still holds
         self.last = None  # the solution of the previous step, if it succeeded
+        self.infeasible = False  # whether the previous step needed the relaxed bounds
         self.x_compared = None  # the state at which guesses were last compared
         self.last_w = None
         self.stats = {}
@@ -594,6 +602,11 @@ class ScenarioMPC:
                 self.block(bounds[bound], "box", t)[p == 0] = no_bound
         return bounds
 
+    def _hard_slack(self, w):
+        """The largest violation of a hard bound in w, units of the box's half-widths: not zero only in the relaxed problem."""
+        slack = [np.stack([self.block(w, name, t).max(1) for name in ("below", "above")]) for t in range(1, self.horizon + 1)]
+        return np.max(slack, axis=0)[np.isinf(self.slack_price)].max(initial=0)
+
     def _expand(self, w, order=2):
         """With a Taylor value and no fixed point to expand at: expand where each scenario of w ends."""
         if self.taylor is not None and self.expand_at is None:
@@ -620,8 +633,9 @@ class ScenarioMPC:
         """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
 
         Ladder: a solve, from the shifted previous plan or from the actor's rollout, whichever costs less; if it does not succeed,
-        one more from a cold guess that was not tried yet (with relaxed bounds, if relaxed_price is given); then the next action
-        of the last successful plan, while it lasts; then the actor, or without one the last action. `stats` says which.
+        one more from a cold guess that was not tried yet (with relaxed bounds, if relaxed_price is given; after a step that needed
+        them they are tried first, and the hard bounds if no slack is left); then the next action of the last successful plan, while
+        it lasts; then the actor, or without one the last action. `stats` says which.
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
@@ -636,13 +650,21 @@ class ScenarioMPC:
                 if no_rival or self._cost(x0, guess[0]) >= self._cost(x0, shifted):
                     start, guess = "warm", (shifted, *multipliers)
         self._expand(guess[0])
-        solution = self._solve(start, x0, self.slack_price, *guess)
+        solution, relaxed = None, None if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
+        if self.infeasible and start == "warm":  # and probably still, which the relaxed problem tells far sooner than the hard one
+            easy = self._solve("warm", x0, relaxed, *guess)
+            if easy is not None and self._hard_slack(easy[0]) > 1e-6:
+                solution = easy
+                self.stats |= {"success": False, "rung": "retry"}
+            guess = easy or guess
+        if solution is None:
+            solution = self._solve(start, x0, self.slack_price, *guess)
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
-            other = self.cold_guess(x0) if start == "warm" or self.relaxed_price is not None else self.hold_guess(x0)
+            other = self.cold_guess(x0) if start == "warm" or relaxed is not None else self.hold_guess(x0)
             self._expand(other)
-            price = self.slack_price if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
-            solution = self._solve("cold", x0, price, other)
+            solution = self._solve("cold", x0, self.slack_price if relaxed is None else relaxed, other)
+        self.infeasible = relaxed is not None and not self.stats["success"]
         self.last = solution
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
@@ -736,13 +758,14 @@ def build_controller(name, args):
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        learned, expansion = {}, Expansion(critic)
+        # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
+        learned, expansion = {"barrier": "adaptive"} if name == "rl_mpc" else {}, Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
             V = V if compile else with_derivatives(V, expansion)
-            learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
+            learned |= dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
-            learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
+            learned |= dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
                           slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
         mpc.expansion = expansion
@@ -751,7 +774,7 @@ def build_controller(name, args):
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
-                       compile=compile)  # fmt: skip
+                       barrier=1e-7, compile=compile)  # fmt: skip
 
 
 def settled_state(plant, mu, goal, steps=1000):

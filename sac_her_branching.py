@@ -217,9 +217,10 @@ class TwinCritic(nn.Module):
 
     def forward(self, z, a):
         h = torch.cat([z, a], dim=-1).expand(2, -1, -1)
-        for w, b in zip(self.weight[:-1], self.bias[:-1]):
+        *hidden, (w_out, b_out) = zip(self.weight, self.bias)  # a slice of a ParameterList would make a new module each time
+        for w, b in hidden:
             h = F.silu(torch.baddbmm(b, h, w))
-        return torch.baddbmm(self.bias[-1], h, self.weight[-1]).squeeze(-1)
+        return torch.baddbmm(b_out, h, w_out).squeeze(-1)
 
 
 class Policy:

@@ -261,8 +261,27 @@ def test_infeasible_benchmark_is_solved_with_relaxed_bounds_and_counted():
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
     stage = ca.Function("stage", [x, g], [(x[1] - g) ** 2])
     controller = mpc(5, stage=stage, robust_horizon=0, slack_price=np.inf, relaxed_price=1e3)
-    controller.make_step(np.array([2.5, 0.3, 55.0, 55.0]))  # above the bound of c_A, which F >= 5 1/h only raises while it is cold
+    x = np.array([2.5, 0.3, 55.0, 55.0])
+    controller.make_step(x)  # above the bound of c_A, which F >= 5 1/h only raises while it is cold
     assert controller.stats["rung"] == "retry" and not controller.stats["success"]
+
+
+def test_relaxed_bounds_first_finds_what_hard_bounds_first_finds():
+    """Two controllers in closed loop from an infeasible start; one forgets at every step that the last one was infeasible."""
+    x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
+    stage = ca.Function("stage", [x, g], [(x[1] - g) ** 2])
+    first, second = (mpc(5, stage=stage, robust_horizon=0, slack_price=np.inf, relaxed_price=1e3) for _ in range(2))
+    state, feasible, saved = np.array([2.6, 0.8, 105.0, 105.0]), [], 0
+    for _ in range(12):
+        second.infeasible = False
+        u, expected = first.make_step(state), second.make_step(state)
+        assert first.stats["success"] == second.stats["success"] and first.stats["rung"] == second.stats["rung"]
+        assert close(u, expected, 1e-3)
+        feasible.append(first.stats["success"])
+        saved += second.stats["iterations"] - first.stats["iterations"]
+        state = cstr.step(state, u, cstr.PSI_NOMINAL)
+    assert feasible[1] is False and feasible[-1] is True  # both kinds of step were met
+    assert saved > 0
 
 
 # Closed loop
