@@ -3,9 +3,12 @@
 import csv
 import hashlib
 import os
+import platform
+import re
 import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
 from pathlib import Path
 
 from tqdm import tqdm
@@ -38,6 +41,14 @@ def run(main, args):
     except KeyboardInterrupt:
         print("interrupted; what is finished is kept, so that the same command continues", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def machine():
+    """Processor and versions, for a table."""
+    info = Path("/proc/cpuinfo")
+    models = re.findall(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.exists() else []
+    versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "casadi"))
+    return f"{models[0] if models else platform.processor()} ({os.cpu_count()} cores), Python {platform.python_version()}, {versions}"
 
 
 def read(path):

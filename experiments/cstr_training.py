@@ -11,7 +11,6 @@ machine) and figures/cstr_training.png.
 
 import csv
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -26,6 +25,7 @@ from scipy.stats import bootstrap, trim_mean
 from tqdm import tqdm
 
 matplotlib.use("Agg")
+import cells
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
@@ -48,17 +48,6 @@ class Args:
     """where the runs are kept, so that a second call continues"""
     out: Path = HERE
     """folder whose results/ and figures/ are written"""
-
-
-def machine():
-    """Processor and versions, for the table."""
-    model = platform.processor()
-    if Path("/proc/cpuinfo").exists():
-        lines = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-        model = lines[0].split(":")[1].strip() if lines else model
-    import torch
-
-    return f"{model} ({os.cpu_count()} cores), Python {platform.python_version()}, torch {torch.__version__}"
 
 
 def train(scenarios, seed, args):
@@ -87,7 +76,7 @@ def collect(args):
         with open(run / "evaluations.csv") as file:
             rows = [{"env": "cstr", "scenarios": scenarios, "seed": seed} | row for row in csv.DictReader(file)]
         curves += rows
-        finals.append(rows[-1] | {"wall_seconds": (run / "wall_seconds.txt").read_text(), "jobs": args.jobs, "machine": machine()})
+        finals.append(rows[-1] | {"wall_seconds": (run / "wall_seconds.txt").read_text(), "jobs": args.jobs, "machine": cells.machine()})
     for name, table in (("cstr_training", curves), ("cstr_training_seeds", finals)):
         path = args.out / "results" / f"{name}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
