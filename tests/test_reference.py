@@ -8,29 +8,15 @@ import numpy as np
 import pytest
 
 from envs import cstr
-from rl_mpc_deploy import ScenarioMPC
+from experiments.literal import LiteralMPC
 
 FIXTURES = Path(__file__).parent / "fixtures"
-SOLUTIONS = {s["mode"]: s for s in json.loads((FIXTURES / "do_mpc_solutions.json").read_text())["solutions"]}
+SOLUTIONS = {(s["mode"], s["n_horizon"]): s for s in json.loads((FIXTURES / "do_mpc_solutions.json").read_text())["solutions"]}
 U_RANGE = cstr.U_HIGH - cstr.U_LOW
 
 
-class LiteralMPC(ScenarioMPC):
-    """do-mpc's conventions: stage cost and constraints at x_0 ... x_{N-1}, slack summed over scenarios; Radau collocation."""
-
-    def node_cost(self, t, x, goal, slack_cost):
-        n = x.shape[1]
-        if t == self.horizon:
-            return ca.sum2(self.terminal_cost.map(n)(x, goal)) / n
-        return ca.sum2(slack_cost) + ca.sum2(self.stage_cost.map(n)(x, goal)) / n
-
-    def _bounds(self, price):
-        bounds = super()._bounds(price)
-        soft = (price > 0) & ~np.isinf(price)  # where the last node's constraint is soft, it is not there
-        for name, bound, no_bound, p in (("below", "lbg", -np.inf, soft[0]), ("above", "ubg", np.inf, soft[1])):
-            self.block(bounds["ubx"], name, self.horizon)[p] = 0.0
-            self.block(bounds[bound], "box", self.horizon)[p] = no_bound
-        return bounds
+class Collocated(LiteralMPC):
+    """Predicts by Radau collocation, as the authors do."""
 
     def _model_step(self):
         """Radau collocation of degree 2, one element, as an implicit function."""
@@ -66,9 +52,9 @@ def reference_value():
     return ca.Function("V", [x, goal], [q])
 
 
-def solve(mode, cls=LiteralMPC):
+def solve(mode, horizon):
     """First solve of the reference problem, cold; returns controller, objective, first action."""
-    given, S = SOLUTIONS[mode], 1 if mode == "nominal" else 9
+    given, S = SOLUTIONS[mode, horizon], 1 if mode == "nominal" else 9
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
     if mode == "nstep_vfmpc":
         stage = ca.Function("stage", [x, g], [-ca.exp(-((g - x[1]) ** 2) / (2 * 0.1**2))])
@@ -77,7 +63,7 @@ def solve(mode, cls=LiteralMPC):
     else:
         stage = terminal = ca.Function("stage", [x, g], [(x[1] - g) ** 2])
         options = dict(slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"])
-    mpc = cls(cstr, given["n_horizon"], cstr.SCENARIOS["mpc"], stage, terminal, goal=[given["goal"]], robust_horizon=int(S > 1),
+    mpc = Collocated(cstr, horizon, cstr.SCENARIOS["mpc"], stage, terminal, goal=[given["goal"]], robust_horizon=int(S > 1),
               tol=1e-8, compile=False, **options)  # fmt: skip
     x0 = np.array(given["x0"])
     mpc.set_initial_guess(x0)
@@ -87,10 +73,10 @@ def solve(mode, cls=LiteralMPC):
     return mpc, mpc.last_objective + float(stage(x0, given["goal"])), u
 
 
-@pytest.mark.parametrize("mode", ["nominal", "baseline", "nstep_vfmpc"])
-def test_literal_variant_agrees_with_the_authors_stack(mode):
-    mpc, objective, u = solve(mode)
+@pytest.mark.parametrize("mode, horizon", [("nominal", 20), ("baseline", 20), ("nstep_vfmpc", 1), ("nstep_vfmpc", 2), ("nstep_vfmpc", 5)])
+def test_literal_variant_agrees_with_the_authors_stack(mode, horizon):
+    mpc, objective, u = solve(mode, horizon)
     # IPOPT widened the reference's slack bounds by 1e-8 each: a bonus of price x slacks x 1e-8 that this solver does not take
     slacks = mpc.horizon * mpc.nodes[-1] * np.array(mpc.slack_price)[np.isfinite(mpc.slack_price)].sum()
-    assert objective == pytest.approx(SOLUTIONS[mode]["objective"] + 1e-8 * slacks, rel=2e-4)
-    assert np.all(np.abs(u - SOLUTIONS[mode]["u0"]) <= 0.01 * U_RANGE), (u, SOLUTIONS[mode]["u0"])
+    assert objective == pytest.approx(SOLUTIONS[mode, horizon]["objective"] + 1e-8 * slacks, rel=2e-4)
+    assert np.all(np.abs(u - SOLUTIONS[mode, horizon]["u0"]) <= 0.01 * U_RANGE), (u, SOLUTIONS[mode, horizon]["u0"])
