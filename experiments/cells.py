@@ -25,7 +25,7 @@ def check(args, table, **ranges):
     for name, (least, most) in ranges.items():
         if not (getattr(args, name) is None or least <= getattr(args, name) <= most):
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in {least} to {most}")
-    for name in ("out",) if args.plot_only else ("runs", "out"):
+    for name in ("out",) if args.plot_only or not hasattr(args, "runs") else ("runs", "out"):
         try:
             getattr(args, name).mkdir(parents=True, exist_ok=True)
         except OSError as error:

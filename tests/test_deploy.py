@@ -170,15 +170,31 @@ def test_the_first_action_is_shared_and_later_ones_are_not():
 
 
 @pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="no C compiler")
-def test_compiled_equals_interpreted(monkeypatch, tmp_path):
+def test_compiled_equals_interpreted(monkeypatch, tmp_path, checkpoint):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    compiled = deploy.ScenarioMPC(cstr, 2, cstr.SCENARIOS["mpc"], gaussian(), goal=GOAL)
+    _, _, V = deploy.export(deploy.load_critic(checkpoint, "cstr", "first"))
+    x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
+    terminal = ca.Function("terminal", [x, g], [-V(x, g)])
+    compiled = deploy.ScenarioMPC(cstr, 2, cstr.SCENARIOS["mpc"], gaussian(), terminal, goal=GOAL)
     assert compiled.compiled and len(list((tmp_path / "rlmpc").iterdir())) == 1
-    a, b = first_solve(compiled), first_solve(mpc(2))
+    a, b = first_solve(compiled), first_solve(mpc(2, terminal=terminal))
     assert a[0] == pytest.approx(b[0], rel=1e-8)
     np.testing.assert_allclose(a[1], b[1], rtol=1e-5, atol=1e-3)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert not deploy.ScenarioMPC(cstr, 2, cstr.SCENARIOS["mpc"], gaussian(), goal=GOAL).compiled
+
+
+def test_loops_of_the_generated_code_are_reordered(checkpoint, tmp_path, monkeypatch):
+    """The text that `vectorised` looks for is in this CasADi's code, and nothing else of it changes."""
+    monkeypatch.chdir(tmp_path)
+    _, _, V = deploy.export(deploy.load_critic(checkpoint, "cstr", "first"))
+    V.generate("V.c")
+    before = Path("V.c").read_text()
+    after = deploy.vectorised(before)
+    changed = [(a.split(), b.split()) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
+    assert len(changed) == 4 and changed[2][0] == changed[3][1] and changed[3][0] == changed[2][1]  # two lines change places
+    assert all(b.count("restrict") > 0 and [word for word in b if word != "restrict"] == a for a, b in changed[:2])
+    assert deploy.vectorised("int nothing;") == "int nothing;"
 
 
 def test_shifting_moves_time_and_not_channels():
