@@ -17,6 +17,7 @@ EXPERIMENTS = {
     "cstr_profile": ["cstr_profile.csv"],
     "dip_performance": ["dip_performance.csv"],
     "dip_equilibria": ["dip_equilibria.csv", "dip_profile.csv"],
+    "solve_time": ["solve_time_where.csv", "solve_time_scaling.csv"],
 }
 FIGURES = {name: name for name in EXPERIMENTS} | {"dip_equilibria": "dip_profile"}
 LINEAR_TABLES = (
@@ -38,8 +39,8 @@ LINEAR_FIGURES = {
 }
 LINEAR_STUDIES = [("linear_scalability", "main"), ("linear_scalability", "sweep")]
 LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distance", "scaling")]
-NO_RUNS = {"cstr_profile", "dip_equilibria"}  # too short to be kept in parts
-TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium", "axis"}
+NO_RUNS = {"cstr_profile", "dip_equilibria", "solve_time"}  # too short to be kept in parts
+TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium", "axis", "part"}
 
 
 def run(name, *arguments):
@@ -86,6 +87,37 @@ def test_linear_figures_are_drawn_from_the_committed_tables(name, study, tmp_pat
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
     run(name, "--study", study, "--plot-only", "--out", tmp_path)
     assert all(path.stat().st_size > 10_000 for path in (tmp_path / "figures").iterdir())
+
+
+def test_training_speed(tmp_path):
+    for study in ("ablation", "peer", "profile"):
+        run("training_speed", "--study", study, "--quick", "--out", tmp_path, "--runs", tmp_path / "runs")
+        check_table(f"training_speed_{study}.csv", tmp_path)
+    assert (tmp_path / "figures/training_speed.png").stat().st_size > 10_000
+    rows = list(csv.DictReader(open(tmp_path / "results/training_speed_peer.csv")))
+    assert int(rows[-1]["updates"]) > 50 and int(rows[-1]["step"]) >= 2000
+
+
+def test_benchmark_without_peers_says_so_and_measures_the_rest(tmp_path):
+    """The peers are not in the requirements of the tests; the committed table holds them."""
+    keep = ["--out", tmp_path, "--runs", tmp_path / "runs"]
+    run("benchmark_peers", "--quick", "--peers", tmp_path / "no", "--peers-new", tmp_path / "no", *keep)
+    rows, committed = (list(csv.DictReader(open(folder / "results/benchmark_peers.csv"))) for folder in (tmp_path, ROOT / "experiments"))
+    assert list(rows[0]) == list(committed[0])
+    for row in rows:
+        assert row["peer_status"] == "not installed" and row["ratio_of_medians"] == ""
+        assert float(row["ours_ms_median"]) > 0 and row["ours_failed"] == "0"
+    for row in committed:
+        if row["same_optimum"] and row["critic"] == "random":
+            assert float(row["same_optimum"]) < 1e-4, row["peer"]
+        assert bool(row["ratio_of_medians"]) == (row["peer_failed"] == "0")  # no ratio where the peer did not converge
+
+
+@pytest.mark.parametrize("name", ["training_speed", "benchmark_peers"])
+def test_speed_figures_are_drawn_from_the_committed_tables(name, tmp_path):
+    shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
+    run(name, "--plot-only", "--out", tmp_path)
+    assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000
 
 
 def test_agents_are_needed_before_their_closed_loops(tmp_path):
