@@ -557,7 +557,7 @@ class ScenarioMPC:
         self.plan_left = 0  # actions that it still holds
         self.last = None  # the solution of the previous step, if it succeeded
         self.infeasible = False  # whether the previous step needed the relaxed bounds
-        self.x_compared = None  # the state at which guesses were last compared
+        self.x_before = self.x_compared = None  # the state of the previous step, and that at which guesses were last compared
         self.last_w = None
         self.stats = {}
 
@@ -649,23 +649,26 @@ class ScenarioMPC:
     def make_step(self, x0):
         """The action (n_u,) for the measured state x0 (n_x,), physical units. Raises ValueError for a state that is not one.
 
-        Ladder: a solve, from the shifted previous plan or from the actor's rollout, whichever costs less; if it does not succeed,
-        one more from a cold guess that was not tried yet (with relaxed bounds, if relaxed_price is given; after a step that needed
-        them they are tried first, and the hard bounds if no slack is left); then the next action of the last successful plan, while
-        it lasts; then the actor, or without one the last action. `stats` says which.
+        Ladder: a solve, from the previous plan shifted by one sampling time (where the state moves slowly also unshifted) or from the
+        actor's rollout, whichever costs less; if it does not succeed, one more from a cold guess that was not tried yet (with relaxed
+        bounds, if relaxed_price is given; after a step that needed them they are tried first, and the hard bounds if no slack is
+        left); then the next action of the last successful plan, while it lasts; then the actor, or without one the last action.
+        `stats` says which.
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
-        start, guess = "warm", self.last
+        start, guess, moved = "warm", self.last, np.inf if self.last is None else np.abs((x0 - self.x_before) / self.x_scale).max()
         # where the plant has hardly moved since the guesses were last compared, the last plan itself is the best one
         if self.last is None or (np.abs(x0 - self.x_compared) > 1e-3 * self.x_scale).any():
             start, guess, self.x_compared = "cold", (self.cold_guess(x0),), x0
             if self.plan is not None:
-                w, *multipliers = self.plan
-                shifted = self._rollout(x0, lambda t, x: self.physical(w, "u", t))
+                # a plan that is not shifted fits a plant that drifts slowly; where things move, it would put the same action off for ever
+                plans = [self.plan, self.last] if moved < 0.03 else [self.plan]
+                plans = [(self._rollout(x0, lambda t, x, w=w: self.physical(w, "u", t)), *multipliers) for w, *multipliers in plans]
+                costs = [self._cost(x0, w) for w, *_ in plans]
                 no_rival = self.actor is None and not hasattr(self.plant, "baseline")
-                if no_rival or self._cost(x0, guess[0]) >= self._cost(x0, shifted):
-                    start, guess = "warm", (shifted, *multipliers)
+                if no_rival or self._cost(x0, guess[0]) >= min(costs):
+                    start, guess = "warm", plans[int(np.argmin(costs))]
         self._expand(guess[0])
         solution, relaxed = None, None if self.relaxed_price is None else np.full((2, self.n_x), self.relaxed_price)
         if self.infeasible and start == "warm":  # and probably still, which the relaxed problem tells far sooner than the hard one
@@ -682,7 +685,7 @@ class ScenarioMPC:
             self._expand(other)
             solution = self._solve("cold", x0, self.slack_price if relaxed is None else relaxed, other)
         self.infeasible = relaxed is not None and not self.stats["success"]
-        self.last = solution
+        self.last, self.x_before = solution, x0
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
         elif self.plan_left > 0:
