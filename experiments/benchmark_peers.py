@@ -236,41 +236,40 @@ def table(rows):
 
 def plot(rows, path):
     """Median (dot) and 95th percentile (line) of every side, by problem, on a logarithmic axis."""
+    critics = {"random": ", random critic", "trained": ", trained critic", "none": ""}
     groups = {}
     for row in rows:
-        name = {"cstr": "reactor", "double_pendulum": "pendulum"}[row["env"]]
-        extra = {
-            "random": "random critic",
-            "trained": "trained critic",
-            "none": "robust MPC" if row["env"] == "cstr" else "goal-conditioned",
-        }
-        groups.setdefault(f"{name}, N = {row['horizon']}, {extra[row['critic']]}", []).append(row)
-    colours = dict(zip(LABELS.values(), ("#D55E00", "#E69F00", "#CC79A7", "#D55E00", "#F0E442", "#E69F00", "#999999")))
-    fig, ax = plt.subplots(figsize=(10, 0.3 * (len(rows) + 2.2 * len(groups))), layout="constrained")
+        name = "reactor, RL+MPC" if row["critic"] != "none" else "reactor, robust MPC" if row["env"] == "cstr" else "pendulum"
+        groups.setdefault(f"{name}, N = {row['horizon']}{critics[row['critic']]}", []).append(row)
+    fig, ax = plt.subplots(figsize=(9, 0.21 * (len(rows) + 2 * len(groups)) + 1), layout="constrained")
     y, ticks = 0, []
 
-    def bar(y, row, side, colour, text):
-        median, p95, failed = (float(row[f"{side}_{key}"]) for key in ("ms_median", "ms_p95", "failed"))
-        ax.plot([median, p95], [y, y], color=colour, lw=2)
-        ax.plot(median, y, "o", color=colour, mec="black", mew=0.5, ms=7)
-        share = f", {failed:.0f} of {int(row['starts']) * int(row['steps'])} solves failed" if failed else ""
-        ax.annotate(f"{text}: {median:.3g} ms{share}", (p95, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8)
+    def bar(row, side, colour, text):
+        nonlocal y
+        ticks.append((y, text))
+        if row[f"{side}_ms_median"]:
+            median, p95, failed = (float(row[f"{side}_{key}"]) for key in ("ms_median", "ms_p95", "failed"))
+            ax.plot([median, p95], [y, y], color=colour, lw=2.5)
+            ax.plot(median, y, "o", color=colour, mec="black", mew=0.5, ms=6)
+            words = f"{median:.3g} ms" + (f", {failed:.0f} of {int(row['starts']) * int(row['steps'])} failed" if failed else "")
+            ax.annotate(words, (p95, y), xytext=(6, 0), textcoords="offset points", va="center", fontsize=8)
+        else:
+            ax.annotate("not installed", (1, y), va="center", fontsize=8)
+        y += 1
 
     for name, mine in groups.items():
-        ticks.append((y, name))
-        middle = sorted(mine, key=lambda row: float(row["ours_ms_median"]))[len(mine) // 2]  # it was timed once beside each peer
-        bar(y, middle, "ours", "#0072B2", "this repository")
+        ax.annotate(name, (0.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9, weight="bold")
+        y += 1
+        # this repository was timed once beside each peer: the middle one
+        bar(sorted(mine, key=lambda row: float(row["ours_ms_median"]))[len(mine) // 2], "ours", "#0072B2", "this repository")
         for row in mine:
-            y += 1
-            if row["peer_ms_median"]:
-                bar(y, row, "peer", colours[row["peer"]], row["peer"])
-            else:
-                ax.annotate(f"{row['peer']}: not installed", (1, y), va="center", fontsize=8)
-        y += 1.7
-    ax.set_yticks(*zip(*ticks), fontsize=9)
-    ax.invert_yaxis()
-    ax.set(xscale="log", xlabel="time of one closed-loop step on one core [ms]: median (dot) to 95th percentile")
-    ax.set_xlim(right=ax.get_xlim()[1] * 60)
+            bar(row, "peer", "#D55E00", row["peer"])
+        y += 0.4
+    ax.set_yticks(*zip(*ticks), fontsize=8)
+    ax.set_ylim(y - 0.4, -0.8)
+    ax.set(xscale="log", xlabel="time of a closed-loop step, one core [ms]: median (dot) to 95th percentile")
+    ax.set_xlim(right=ax.get_xlim()[1] * 10)
+    ax.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     ax.grid(axis="x", alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(path, dpi=150)
