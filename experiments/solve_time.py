@@ -5,7 +5,7 @@
 
 `where`: closed loops over the paired draws of rl_mpc_deploy.py; CasADi's clocks give the function evaluations, IPOPT's own the linear
 algebra, the rest of the solver call and of make_step is what remains. The floor is the bare evaluation of objective, constraints and
-derivatives, once per iteration. `scaling`: cold solves of RL+MPC from the same start states, by horizon (9 scenarios) and by the number
+derivatives, once per iteration. (IPOPT's clock counts whole milliseconds per solve, too coarse for N = 1.) `scaling`: cold solves of RL+MPC from the same start states, by horizon (9 scenarios) and by the number
 of scenarios (N = 5), from square grids over the box of parameters.
 
 Writes results/solve_time_where.csv, results/solve_time_scaling.csv and figures/solve_time.png.
@@ -107,15 +107,20 @@ def floor(controller, repeats):
     """Milliseconds of one bare evaluation of every function that an iteration needs, at the last plan."""
     solver, w = controller.solvers["warm"].solver, controller.last_w
     p = controller._parameters(cstr.START, np.minimum(controller.slack_price, 1e3))
-    lam = np.zeros(controller.nlp["g"].numel())
-    total = 0.0
+    lam, total = np.zeros(controller.nlp["g"].numel()), 0.0
     for name in FUNCTIONS:
         function = solver.get_function(f"nlp_{name}")
-        arguments = [w, p, 1.0, lam][: function.n_in()]
-        buffers, times = [np.array(a, dtype=float) for a in arguments], []
+        buffer, evaluate = function.buffer()  # calls without a copy of arguments and results
+        arguments = [np.array(a, dtype=float) for a in (w, p, 1.0, lam)[: function.n_in()]]
+        results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
+        for i, value in enumerate(arguments):
+            buffer.set_arg(i, memoryview(value.reshape(-1)))
+        for i, value in enumerate(results):
+            buffer.set_res(i, memoryview(value))
+        times = []
         for _ in range(repeats):
             tick = time.perf_counter()
-            function(*buffers)
+            evaluate()
             times.append(time.perf_counter() - tick)
         total += 1e3 * np.median(times)
     return total
