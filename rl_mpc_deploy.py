@@ -499,6 +499,7 @@ class ScenarioMPC:
             J += ca.sum2(self.taylor.cost.map(self.nodes[-1])(x, theta)) / self.nodes[-1]
         self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price, theta), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
+        self.known_bounds = {}  # of `_bounds`, by slack price
         self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
         self.step = step
 
@@ -637,7 +638,10 @@ class ScenarioMPC:
     def _solve(self, which, x0, price, guess, lam_x=0, lam_g=0):
         """One call of IPOPT: (w, lam_x, lam_g) if it succeeded, else None. An unsuccessful iterate is not returned."""
         solver = self.solvers[which]
-        result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **self._bounds(price))
+        if price.tobytes() not in self.known_bounds:
+            self.known_bounds[price.tobytes()] = self._bounds(price)
+        bounds = self.known_bounds[price.tobytes()]
+        result = solver(x0=guess, p=self._parameters(x0, price), lam_x0=lam_x, lam_g0=lam_g, **bounds)
         self.last_objective = float(result["f"])
         stats = solver.stats()
         self.stats["status"] = stats["return_status"]

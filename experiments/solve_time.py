@@ -4,9 +4,9 @@
     python experiments/solve_time.py --plot-only        # redraw from the committed CSV
 
 `where`: closed loops over the paired draws of rl_mpc_deploy.py; CasADi's clocks give the function evaluations, IPOPT's own the linear
-algebra, the rest of the solver call and of make_step is what remains. The floor is the bare evaluation of objective, constraints and
-derivatives, once per iteration. (IPOPT's clock counts whole milliseconds per solve, too coarse for N = 1.) `scaling`: cold solves of RL+MPC from the same start states, by horizon (9 scenarios) and by the number
-of scenarios (N = 5), from square grids over the box of parameters.
+algebra (in whole milliseconds per solve, too coarse for N = 1), the rest of the solver call and of make_step is what remains. The floor
+is the bare evaluation of objective, constraints and derivatives, once per iteration. `scaling`: cold solves of RL+MPC from the same start
+states, by horizon (9 scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters.
 
 Writes results/solve_time_where.csv, results/solve_time_scaling.csv and figures/solve_time.png.
 """
