@@ -666,11 +666,11 @@ class ScenarioMPC:
         if self.last is None or (np.abs(x0 - self.x_compared) > 1e-3 * self.x_scale).any():
             start, guess, self.x_compared = "cold", (self.cold_guess(x0),), x0
             if self.plan is not None:
+                no_rival = self.actor is None and not hasattr(self.plant, "baseline")
                 # a plan that is not shifted fits a plant that drifts slowly; where things move, it would put the same action off for ever
-                plans = [self.plan, self.last] if moved < 0.03 else [self.plan]
+                plans = [self.plan, self.last] if moved < 0.03 and not no_rival else [self.plan]
                 plans = [(self._rollout(x0, lambda t, x, w=w: self.physical(w, "u", t)), *multipliers) for w, *multipliers in plans]
                 costs = [self._cost(x0, w) for w, *_ in plans]
-                no_rival = self.actor is None and not hasattr(self.plant, "baseline")
                 if no_rival or self._cost(x0, guess[0]) >= min(costs):
                     start, guess = "warm", plans[int(np.argmin(costs))]
         self._expand(guess[0])

@@ -266,8 +266,10 @@ def plot(args):
     axes[1].axhline(2.2, color="black", lw=1, ls=":", label="2.2 %")
     axes[1].set(xscale="log", yscale="log", xlabel="training time on one core [s]", ylabel="robust error [%]",
                 title="a line per seed")  # fmt: skip
-    axes[1].yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-    axes[1].legend(frameon=False, fontsize=8)
+    for axis, ticks in ((axes[1].xaxis, (3, 10, 30, 100, 300)), (axes[1].yaxis, (2, 3, 5, 10, 20, 50))):
+        axis.set_ticks(ticks, [str(tick) for tick in ticks])
+        axis.set_ticks([], minor=True)
+    axes[1].legend(fontsize=8, loc="upper right")
     for ax in axes:
         ax.grid(alpha=0.3)
         ax.title.set_fontsize(9)
