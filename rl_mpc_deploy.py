@@ -416,7 +416,8 @@ class ScenarioMPC:
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
     taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: the state (n_x,) to expand at, or
     None for where each scenario's guess ends.
-    barrier: IPOPT's barrier parameter at the start of a warm solve, or "adaptive" (mu_strategy, of every solve).
+    barrier: IPOPT's barrier parameter at the start of a warm solve, or "adaptive" (mu_strategy, of every solve). A smaller one saves
+    iterations and leaves fewer local optima: at 1e-7 the benchmarks are twice as fast and stuck more often.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
@@ -798,7 +799,7 @@ def build_controller(name, args):
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
-                       barrier=1e-7, compile=compile)  # fmt: skip
+                       compile=compile)  # fmt: skip
 
 
 def settled_state(plant, mu, goal, steps=1000):

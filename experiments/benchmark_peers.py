@@ -115,7 +115,7 @@ def problems(env, horizon, kind, peer, seed, tol=1e-6, compile=True):
              "uncertainty": {"alpha": [1.0, 0.95, 1.05], "beta": [1.0, 0.9, 1.1]}}  # fmt: skip
     if kind == "none":  # the robust benchmark
         stage = ca.Function("stage", [x, g], [squared_error])
-        mpc = LiteralMPC(plant, horizon, scenarios, stage, stage, goal=plant.EVAL_GOAL, relaxed_price=1e3, barrier=1e-7,
+        mpc = LiteralMPC(plant, horizon, scenarios, stage, stage, goal=plant.EVAL_GOAL, relaxed_price=1e3,
                          slack_price=plant.BENCHMARK["slack_price"], change_weight=plant.BENCHMARK["change_weight"], **options)  # fmt: skip
         # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 and this repository sum it
         words |= {"change_weight": {"F": 9 * 0.1, "Q_dot": 9 * 1e-3}, "soft": {"T_R": (140.0, 100.0)},
