@@ -1,7 +1,7 @@
 """Figure `cstr_rlmpc`: actor, nominal MPC, robust MPC and RL+MPC on paired draws of start state and plant; and which learned value
 serves RL+MPC best.
 
-    python experiments/cstr_deploy.py --jobs 2      # 50 draws, half an hour; continues, variant by variant, where it stopped
+    python experiments/cstr_deploy.py --jobs 2      # 50 draws, four minutes; continues, variant by variant, where it stopped
     python experiments/cstr_deploy.py --study value --episodes 10
     python experiments/cstr_deploy.py --study expansion
     python experiments/cstr_deploy.py --plot-only   # redraw from the committed CSV
