@@ -117,7 +117,8 @@ def problems(env, horizon, kind, peer, seed, tol=1e-6, compile=True):
     if kind not in ("random", "trained"):  # the robust benchmark; a small barrier is faster, but leaves fewer local optima
         stage = ca.Function("stage", [x, g], [squared_error])
         mpc = LiteralMPC(plant, horizon, scenarios, stage, stage, goal=plant.EVAL_GOAL, relaxed_price=1e3,
-                         barrier=1e-4 if kind == "none" else 1e-7, slack_price=plant.BENCHMARK["slack_price"], change_weight=plant.BENCHMARK["change_weight"], **options)  # fmt: skip
+                         slack_price=plant.BENCHMARK["slack_price"], change_weight=plant.BENCHMARK["change_weight"],
+                         barrier=1e-4 if kind == "none" else 1e-7, **options)  # fmt: skip
         # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 and this repository sum it
         words |= {"change_weight": {"F": 9 * 0.1, "Q_dot": 9 * 1e-3}, "soft": {"T_R": (140.0, 100.0)},
                   "hard": {"c_A": (0.1, 2.0), "c_B": (0.1, 2.0), "T_R": (50.0, None), "T_K": (50.0, 140.0)}}  # fmt: skip
