@@ -95,7 +95,7 @@ def test_training_speed(tmp_path):
         check_table(f"training_speed_{study}.csv", tmp_path)
     assert (tmp_path / "figures/training_speed.png").stat().st_size > 10_000
     rows = list(csv.DictReader(open(tmp_path / "results/training_speed_peer.csv")))
-    assert int(rows[-1]["updates"]) > 50 and int(rows[-1]["step"]) >= 2000
+    assert int(rows[-1]["updates"]) > 30 and int(rows[-1]["step"]) >= 2000
 
 
 def test_benchmark_without_peers_says_so_and_measures_the_rest(tmp_path):
