@@ -783,16 +783,18 @@ def build_controller(name, args):
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
-        learned, expansion = {"barrier": "adaptive"} if name == "rl_mpc" else {}, Expansion(critic)
+        learned, expansion = {}, Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
             V = V if compile else with_derivatives(V, expansion)
-            learned |= dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
+            learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
-            learned |= dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
+            learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
+        # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
+        barrier = "adaptive" if learned else 1e-4
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
-                          slack_price=args.slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
+                          barrier=barrier, slack_price=args.slack_weight if args.constraints == "soft" else np.inf,
+                          **learned)  # fmt: skip
         mpc.expansion = expansion
         return mpc
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK

@@ -184,7 +184,7 @@ def measure(cell):
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
     mpc, words = problems(env, horizon, kind, peer, seed)
-    plant, other = mpc.plant, Peer(python, words) if Path(python).exists() else None
+    plant, other, same = mpc.plant, None, ""
     rng = np.random.default_rng([seed, 5])
     base = CSTR_START if plant is cstr else plant.START
     x_starts = (
@@ -192,7 +192,10 @@ def measure(cell):
     )  # the first as it is
     psi = plant.EVAL_PSI[rng.integers(len(plant.EVAL_PSI), size=starts)]
     psi[0] = plant.PSI_NOMINAL
-    mine, theirs, same = [], [], ""
+    if Path(python).exists():
+        same = same_optimum(cell, x_starts[0]) if words["model"] == "rk4" else ""
+        other = Peer(python, words)
+    mine, theirs = [], []
     for i in range(starts):
         mpc.reset()
         mpc.set_initial_guess(x_starts[i])
@@ -207,7 +210,6 @@ def measure(cell):
             y = plant.step(y, np.clip(theirs[-1]["u"], plant.U_LOW, plant.U_HIGH), psi[i])
     if other is not None:
         other.close()
-        same = same_optimum(cell, x_starts[0]) if words["model"] == "rk4" else ""
     critic = kind if kind in ("random", "trained") else "none"
     row = {
         "env": env,
