@@ -1,6 +1,6 @@
 """Solve times beside the authors' stack, do-mpc with L4CasADi: the same optimal control problems, one core, step by step in turn.
 
-    python experiments/benchmark_peers.py                  # twenty minutes, in one process: nothing else should run
+    python experiments/benchmark_peers.py                  # eight minutes, in one process: nothing else should run
     python experiments/benchmark_peers.py --plot-only      # redraw from the committed CSV
 
 The peers live in environments of their own (see requirements-peers.txt and requirements-peers-new.txt for how they are made); where one
