@@ -12,6 +12,7 @@ measured, its reward is a constant, and V(x_N) counts rewards from x_{N+1} on. T
 start state and plant, with the actor alone and with nominal and robust MPC.
 
     python rl_mpc_deploy.py --horizon 5                                            # with the critic that the repository ships
+    python rl_mpc_deploy.py --critic experiments/pretrained/cstr_robust.pt         # as in the paper: a critic blind to constraints
     python rl_mpc_deploy.py --horizon 5 --critic runs/NAME/checkpoint.pt           # with your own
     python rl_mpc_deploy.py --horizon 0 --episodes 20 --goal 0.7 --jobs 2          # no prediction: the critic's best action
 
@@ -62,7 +63,8 @@ class Args:
     horizon: int = 5
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
     critic: Path | None = None
-    """a checkpoint.pt of sac_her_branching.py; default: experiments/pretrained/{env}_robust.pt"""
+    """a checkpoint.pt of sac_her_branching.py; default: experiments/pretrained/{env}_constrained.pt, where there is none {env}_robust.pt
+    (cstr: the first knows the price of constraints, the second is the paper's)"""
     goal: tuple[float, ...] | None = None
     """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
     episodes: int = 4
@@ -79,8 +81,9 @@ class Args:
     sigma: float | None = None
     """RL+MPC: width of the Gaussian stage cost, units of the goal; default: the plant's
     (cstr: 0.1 as in the paper's script; its text says 0.25)"""
-    slack_weight: float = 1.0
-    """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step"""
+    slack_weight: float | None = None
+    """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step; default: 2 with a critic
+    that was trained with --constraint-weight, 1 with one that was not, as in the paper"""
     constraints: Literal["soft", "hard"] = "soft"
     """RL+MPC: hard is the paper's variant that gets stuck or infeasible"""
     value: Literal["exact", "taylor", "taylor-local"] = "exact"
@@ -137,6 +140,7 @@ class Critic:
     def __init__(self, data, combine):
         self.plant = envs.load(data["env"], **data.get("plant_options", {}))
         self.network, self.goal_input, self.combine = data["network"], data["goal_input"], combine
+        self.slack_weight = 2.0 if data["args"].get("constraint_weight") else 1.0  # the default price in a plan that ends in this value
         self.actor, self.critic = Actor(**self.network).double(), TwinCritic(**self.network).double()
         self.actor.load_state_dict(data["actor"])
         self.critic.load_state_dict(data["critic"])
@@ -792,9 +796,9 @@ def build_controller(name, args):
             learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
         # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
         barrier = "adaptive" if learned else 1e-4
+        slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
-                          barrier=barrier, slack_price=args.slack_weight if args.constraints == "soft" else np.inf,
-                          **learned)  # fmt: skip
+                          barrier=barrier, slack_price=slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
         mpc.expansion = expansion
         return mpc
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK
@@ -816,7 +820,8 @@ def settled_state(plant, mu, goal, steps=1000):
 
 
 def critic_path(args):
-    return args.critic or Path(__file__).parent / f"experiments/pretrained/{args.env}_robust.pt"
+    shipped = [Path(__file__).parent / f"experiments/pretrained/{args.env}_{kind}.pt" for kind in ("constrained", "robust")]
+    return args.critic or (shipped[0] if shipped[0].exists() else shipped[1])
 
 
 # Closed loop

@@ -102,6 +102,8 @@ class Args:
     """transitions collected per update; default: the plant's (cstr: 8, linear: 16)"""
     entropy_in_target: bool = True
     """SAC's soft value; off: the critic counts reward alone, the actor still maximises Q plus entropy"""
+    add_plant_data: Path | None = None
+    """a trajectories.npz of rl_mpc_deploy.py: closed loops of plants that the simulation stands for, put into the replay buffer first"""
     buffer_size: int | None = None
     """transitions that the replay buffer holds; default: the plant's (cstr: 200000)"""
     target_entropy: float | None = None
@@ -290,6 +292,13 @@ class HERBuffer:
             self.end[(self.end == self.OPEN) & done] = self.now
             self.episode_start[done] = self.now + 1
         self.now += 1
+
+    def add_episodes(self, x, u, goal):
+        """Whole episodes x (E, T + 1, n_x), u (E, T, n_u) with goals (E, n_goal); too few for a row of plants: filled up with others."""
+        for first in range(0, len(x), self.num_envs):
+            group, steps = np.arange(first, first + self.num_envs) % len(x), u.shape[1]
+            for t in range(steps):
+                self.add(x[group, t], u[group, t], goal[group], x[group, t + 1], None, np.full(self.num_envs, t == steps - 1))
 
     def sample(self, batch_size, generator):
         """x (B, n_x), u (B, n_u), goal (B, n_goal), next states (B, K, n_x): one goal for all branches of a transition."""
@@ -513,9 +522,26 @@ def check(args):
     size = len(plant.X_LOW) * (2 + (args.branches if args.branches > 1 else 0)) + len(plant.U_LOW) + len(plant.GOAL_INDEX) + 4
     if args.buffer_size > 10**10 // (4 * size):
         fail(f"--buffer-size is {args.buffer_size}; at most {10**10 // (4 * size)} transitions are allowed, ten gigabytes")
+    if args.add_plant_data and args.branches > 1:
+        fail(f"--branches is {args.branches}; --add-plant-data needs 1, since a plant gives one next state per action")
     if args.device == "cuda" and not torch.cuda.is_available():
         fail("--device is cuda, but torch finds no CUDA device here; use auto or cpu")
     return plant
+
+
+def load_plant_data(path, plant):
+    """Trajectories x (E, T + 1, n_x), u (E, T, n_u) of every controller in a trajectories.npz."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            x, u = (np.concatenate([data[name] for name in sorted(data.files) if name.endswith(end)]) for end in ("_x", "_u"))
+        if not (x.shape[0], x.shape[1] - 1, *x.shape[2:], u.shape[2]) == (*u.shape[:2], len(plant.X_LOW), len(plant.U_LOW)):
+            raise ValueError
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            raise ValueError
+    except Exception as error:  # missing, truncated, not an archive, of another plant: one sentence for all of them
+        reason = f"not a trajectories.npz of {plant.ENV_ID} ({type(error).__name__})" if path.exists() else "does not exist"
+        fail(f"--add-plant-data {path}: {reason}")
+    return x, u
 
 
 def load_resume(path):
@@ -525,6 +551,7 @@ def load_resume(path):
         if state["format"] != "rlmpc-resume-1":
             raise ValueError
         stored = state["args"] | {"hidden": tuple(state["args"]["hidden"]), "out": Path(state["args"]["out"])}
+        stored |= {"add_plant_data": Path(stored["add_plant_data"])} if stored.get("add_plant_data") else {}
         return Args(**stored), state
     except Exception as error:  # missing, truncated, a text file, a pickle of something else: one sentence for all of them
         reason = f"not a resume.pt of this script ({type(error).__name__})" if path.exists() else "does not exist"
@@ -539,6 +566,7 @@ def main(args):
             fail(f"--resume {args.resume} continues with the arguments that the run was started with; give no others")
         args, state = load_resume(args.resume)
     plant = check(args)
+    plant_data = load_plant_data(args.add_plant_data, plant) if args.add_plant_data and not state else None
     run_dir = run_dir or args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
     try:
         run_dir.mkdir(parents=True, exist_ok=state is not None)
@@ -560,6 +588,8 @@ def main(args):
                        plant.GOAL_INDEX, args.branches, args.her_strategy, args.her_ratio, device)  # fmt: skip
     rng = np.random.default_rng([args.seed, 2])  # random actions before learning starts
     obs, _ = vec.reset(seed=args.seed)
+    if plant_data:
+        buffer.add_episodes(*plant_data, rng.choice(plant.TRAIN_GOALS, size=len(plant_data[0])))
     returns, finished, step, updates, seconds, rows = np.zeros(args.num_envs), [], 0, 0, 0.0, []
     if state:
         agent.load_state_dict(state["agent"])

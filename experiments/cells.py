@@ -11,6 +11,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+from scipy.stats import bootstrap, trim_mean
 from tqdm import tqdm
 
 
@@ -49,6 +51,17 @@ def machine():
     models = re.findall(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.exists() else []
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "casadi"))
     return f"{models[0] if models else platform.processor()} ({os.cpu_count()} cores), Python {platform.python_version()}, {versions}"
+
+
+def iqm(values):
+    """Interquartile mean, computed as rliable does (without the lowest and the highest quarter, rounded down to whole seeds), and the ends
+    of its 95 % bootstrap interval, not a number for fewer than three."""
+    low = high = float("nan")
+    if len(values) > 2:
+        low, high = bootstrap(
+            (values,), lambda v, axis: trim_mean(v, 0.25, axis=axis), method="percentile", rng=np.random.default_rng(0)
+        ).confidence_interval
+    return float(trim_mean(values, 0.25)), float(low), float(high)
 
 
 def read(path):

@@ -1,16 +1,15 @@
-"""Figure `cstr_rlmpc`: actor, nominal MPC, robust MPC and RL+MPC on paired draws of start state and plant; and which learned value
-serves RL+MPC best.
+"""Figures `cstr_rlmpc` and `full_cstr_rlmpc`: every controller of the reactor on paired draws of start state and plant.
 
-    python experiments/cstr_deploy.py --jobs 2      # 50 draws, four minutes; continues, variant by variant, where it stopped
-    python experiments/cstr_deploy.py --study value --episodes 10
-    python experiments/cstr_deploy.py --study expansion
-    python experiments/cstr_deploy.py --plot-only   # redraw from the committed CSV
+    python experiments/cstr_deploy.py --jobs 2                   # 200 draws, half an hour; continues where it stopped
+    python experiments/cstr_deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
+    python experiments/cstr_deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours
+    python experiments/cstr_deploy.py --study expansion --jobs 2 # the learned value and its second-order expansions
+    python experiments/cstr_deploy.py --plot-only                # redraw from the committed CSV
 
-Writes results/cstr_deploy.csv (a row per controller and draw, columns of rl_mpc_deploy.py) and figures/cstr_deploy.png; the other
-studies write cstr_value and cstr_expansion.
+Writes results/cstr_deploy.csv (a row per controller and draw), figures/cstr_deploy.png and cstr_deploy_full.png; the other studies write
+cstr_STUDY. How far each controller is from the best possible is said by cstr_oracle.py.
 """
 
-import hashlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Literal
 
 import matplotlib
 import numpy as np
+import seaborn as sns
 import tyro
 
 matplotlib.use("Agg")
@@ -26,107 +26,127 @@ import matplotlib.pyplot as plt
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
+import cstr_loops as loops
+import cstr_tune
 
 import rl_mpc_deploy as deploy
 
-PRETRAINED = HERE / "pretrained"
-STUDIES = {  # name: {label: settings of rl_mpc_deploy.py}
+PAPER, AWARE = dict(critic=loops.ROBUST), dict(critic=loops.CONSTRAINED)
+ACTOR, RL_MPC = dict(controllers=("actor",)), dict(controllers=("rl_mpc",))
+TUNED = cstr_tune.settings(prices=(0.1, 1.0), change=0.1, horizon=20)  # best of cstr_tune.py
+HORIZONS = (0, 1, 2, 5, 10)
+STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
     "deploy": {
         "nominal MPC, N = 20": dict(controllers=("nominal_mpc",)),
         "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
-        "RL (actor alone)": dict(controllers=("actor",)),
-        "RL+MPC, N = 5": dict(controllers=("rl_mpc",)),
-        "RL, constraint-aware": dict(controllers=("actor",), critic=PRETRAINED / "cstr_constrained.pt"),
-        "RL+MPC, N = 5, constraint-aware": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_constrained.pt"),
-        "RL+MPC, N = 5, slack weight 3": dict(controllers=("rl_mpc",), slack_weight=3.0),
+        "robust MPC, tuned": dict(controllers=("robust_mpc",), benchmark=TUNED),
+        "goal-conditioned MPC, N = 5": dict(controllers=("goal_mpc",), **AWARE),
+        "RL, paper's": ACTOR | PAPER,
+        **{f"RL+MPC, paper's, N = {n}": RL_MPC | PAPER | dict(horizon=n) for n in HORIZONS},
+        "RL, constraint-aware": ACTOR | AWARE,
+        **{f"RL+MPC, constraint-aware, N = {n}": RL_MPC | AWARE | dict(horizon=n) for n in HORIZONS},
+        "the same, N = 5, hard constraints": RL_MPC | AWARE | dict(constraints="hard"),
     },
-    "value": {
-        "first critic": dict(controllers=("rl_mpc",)),
-        "minimum of both critics": dict(controllers=("rl_mpc",), combine="min"),
-        "mean of both critics": dict(controllers=("rl_mpc",), combine="mean"),
-        "no entropy in the target": dict(controllers=("rl_mpc",), critic=PRETRAINED / "cstr_no_entropy.pt"),
+    "literal": {
+        f"{title}, N = {n}": RL_MPC | PAPER | dict(horizon=n) | options
+        for n in (1, 2, 5)
+        for title, options in {
+            "this repository": {},
+            "slack summed over scenarios": dict(slack_weight=9.0),
+            "sum as printed": dict(like="printed"),
+            "as in the authors' stack": dict(like="literal"),
+        }.items()
     },
     "expansion": {
-        "exact value": dict(controllers=("rl_mpc",)),
-        "taylor": dict(controllers=("rl_mpc",), value="taylor"),
-        "taylor-local": dict(controllers=("rl_mpc",), value="taylor-local"),
+        title: RL_MPC | PAPER | dict(value=value)
+        for title, value in {"exact value": "exact", "expanded at the settled state": "taylor", "re-expanded": "taylor-local"}.items()
     },
 }
+MAIN = ["robust MPC, N = 20", "robust MPC, tuned", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
+        "RL+MPC, constraint-aware, N = 5"]  # fmt: skip
+KINDS = {"paper's": (), "constraint-aware": ("--constraint-weight", "3")}  # of agents, how they are trained
+MEASURES = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
 
 
 @dataclass
 class Args:
-    study: Literal["deploy", "value", "expansion"] = "deploy"
-    """deploy: the controllers against each other; value: RL+MPC with each way to read a value out of a checkpoint; expansion: with that
-    value and its second-order expansions"""
-    episodes: int = 50
-    """paired draws"""
+    study: Literal["deploy", "critics", "literal", "expansion"] = "deploy"
+    """deploy: the controllers against each other; critics: of other training seeds; literal: conventions of the authors' code; expansion:
+    the learned value's second-order expansions"""
+    episodes: int | None = None
+    """paired draws; default: 200, in the other studies 50"""
     seed: int = 0
     """seed of the draws"""
     jobs: int = 2
     """processes"""
     quick: bool = False
-    """2 draws of 10 steps: a smoke test"""
+    """2 draws of 3 steps: a smoke test"""
     plot_only: bool = False
     """redraw the figure from the CSV"""
-    runs: Path = Path("runs/cstr_deploy")
-    """where finished variants are kept, so that a second call continues"""
+    runs: Path = Path("runs/cstr_loops")
+    """where finished blocks and agents are kept, so that a second call continues"""
     out: Path = HERE
     """folder whose results/ and figures/ are written"""
 
 
-def collect(args):
-    episodes, steps = (2, 10) if args.quick else (args.episodes, 100)
-    rows = []
-    for variant, settings in STUDIES[args.study].items():
-        settings = deploy.Args(horizon=5, episodes=episodes, steps=steps, seed=args.seed, jobs=args.jobs, **settings)
-        inputs = [Path(deploy.__file__), Path(deploy.__file__).parent / "envs/cstr.py", deploy.critic_path(settings)]
-        version = hashlib.sha256(repr(settings).encode() + b"".join(p.read_bytes() for p in inputs)).hexdigest()[:12]
-        path = args.runs / f"{version}.csv"  # another script, plant, critic or setting is another file
-        if not path.exists():
-            print(variant)
-            cells.write([{"variant": variant, "slack_weight": settings.slack_weight} | row for row in deploy.compare(settings)[0]], path)
-        rows += [row | {"variant": variant} for row in cells.read(path)]  # studies that share a variant name it differently
-    cells.write(rows, args.out / f"results/cstr_{args.study}.csv")
+def variants(args):
+    if args.study != "critics":
+        return STUDIES[args.study]
+    agents = [(kind, seed, flags) for kind, flags in KINDS.items() for seed in ((1,) if args.quick else (1, 2, 3))]
+    paths = loops.train([(seed, *flags) for _, seed, flags in agents], args)
+    found = {}
+    for (kind, seed, _), path in zip(agents, paths):
+        found |= {f"RL, {kind}, seed {seed}": ACTOR | dict(critic=path), f"RL+MPC, {kind}, seed {seed}": RL_MPC | dict(critic=path)}
+    return found
 
 
-def plot(args):
-    variants, rows = STUDIES[args.study], cells.read(args.out / f"results/cstr_{args.study}.csv")
-    columns = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
-    fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.45 * len(variants)), sharey=True, layout="constrained")
-    print(f"{'':33s}{'time near goal':>27s}{'time outside constraints':>39s}{'offset':>9s}{'solve ms':>16s}{'failed':>9s}")
-    print(
-        f"{'':33s}{'median  5 %-ile    worst':>27s}{'median  5 %-ile    worst     mean':>39s}{'%':>9s}{'median     p95':>16s}{'solves':>9s}"
-    )
-    for position, variant in enumerate(variants):
-        mine = {key: np.array([row[key] for row in rows if row["variant"] == variant]) for key in rows[0]}
-        line = f"{variant:33s}"
-        for ax, (key, title) in zip(axes, columns.items()):
-            values = mine[key].astype(float)
-            colour = deploy.STYLES[mine["controller"][0]][0]
-            ax.boxplot(values, positions=[-position], orientation="horizontal", widths=0.6, whis=(5, 95), showfliers=False,
-                       medianprops=dict(color=colour, lw=2.5))  # fmt: skip
-            jitter = np.random.default_rng(0).uniform(-0.2, 0.2, len(values))
-            ax.plot(values, jitter - position, "o", color=colour, ms=3, alpha=0.5)
-            ax.set_xlabel(title)
-            line += f"{np.median(values):9.1f}{np.quantile(values, 0.05):9.1f}{values.min():9.1f}   "
-        times, failed = (mine[key].astype(float) for key in ("solve_ms_median", "solver_failures"))
-        print(f"{line[:-3]}{values.mean():9.1f}{np.median(mine['ape_tail'].astype(float)):9.2f}{np.median(times):8.1f}"
-              f"{np.quantile(mine['solve_ms_p95'].astype(float), 0.5):8.1f}{failed.sum():9.0f}")  # fmt: skip
-    axes[0].set_yticks(-np.arange(len(variants)), list(variants))
-    for ax in axes:
+def print_table(rows):
+    print(f"{'':37s}{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}{'solve ms':>16s}{'failed':>8s}")
+    titles = f"{'median':>9s}{'5 %-ile':>8s}{'worst':>8s}"
+    print(f"{'':37s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'solves':>8s}")
+    for label in dict.fromkeys(row["variant"] for row in rows):
+        text = f"{label:37s}"
+        for key in MEASURES:
+            found = loops.values(rows, label, key)
+            text += f"{np.median(found):9.1f}{np.quantile(found, 0.05):8.1f}{found.min():8.1f}   "
+        offset, median, p95, failed = (
+            loops.values(rows, label, k) for k in ("ape_tail", "solve_ms_median", "solve_ms_p95", "solver_failures")
+        )
+        print(f"{text[:-3]}{found.mean():9.1f}{np.median(offset):9.2f}{np.median(median):8.1f}{np.median(p95):8.1f}{failed.sum():8.0f}")
+
+
+def figure(rows, labels, path):
+    """The paper's boxen plot of both measures."""
+    fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.4 * len(labels)), sharey=True, layout="constrained")
+    rows = [row for label in labels for row in rows if row["variant"] == label]
+    colours = {row["variant"]: deploy.STYLES[row["controller"]][0] for row in rows}
+    for ax, (key, title) in zip(axes, MEASURES.items()):
+        data = {"variant": [row["variant"] for row in rows], title: [float(row[key]) for row in rows]}
+        sns.boxenplot(data, x=title, y="variant", hue="variant", palette=colours, legend=False, flier_kws={"s": 4}, ax=ax)
         ax.grid(axis="x", alpha=0.3)
-    fig.suptitle(f"{len(rows) // len(variants)} paired draws of start state and plant; box 25-75 %, whiskers 5-95 %", fontsize=10)
-    path = args.out / f"figures/cstr_{args.study}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
+        ax.set_ylabel("")
+    draws = len({row["episode"] for row in rows})
+    fig.suptitle(f"{draws} paired draws of start state and plant; boxes hold 50, 75, 87.5 ... % of them", fontsize=10)
     fig.savefig(path, dpi=150)
+    plt.close(fig)
 
 
 def main(args):
+    name = f"cstr_{args.study}"
+    cells.check(args, f"{name}.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
+    table = args.out / f"results/{name}.csv"
     if not args.plot_only:
-        collect(args)
-    plot(args)
+        episodes = 2 if args.quick else args.episodes or (200 if args.study == "deploy" else 50)
+        rows = loops.collect(variants(args), args, episodes, seed=args.seed, steps=3 if args.quick else 100)
+        cells.write(loops.table(rows), table)
+    rows = cells.read(table)
+    print_table(rows)
+    (args.out / "figures").mkdir(parents=True, exist_ok=True)
+    labels = list(dict.fromkeys(row["variant"] for row in rows))
+    if args.study == "deploy":
+        figure(rows, labels, args.out / "figures/cstr_deploy_full.png")
+    figure(rows, MAIN if args.study == "deploy" else labels, args.out / f"figures/{name}.png")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -1,12 +1,13 @@
 """Figure `cstr_rlmpc_profile`: every controller from the paper's start state, where the benchmark MPC gets stuck.
 
     python experiments/cstr_profile.py              # about a minute
+    python experiments/cstr_profile.py --goal 0.65 --start 0.8 0.3 60 60 --out runs/cold
     python experiments/cstr_profile.py --plot-only  # redraw from the committed CSV
 
+The actor is the paper's, blind to constraints; RL+MPC is the default of rl_mpc_deploy.py, with soft and with hard constraints.
 Writes results/cstr_profile.csv (a row per controller and sampling time) and figures/cstr_profile.png.
 """
 
-import csv
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,18 @@ import tyro
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-import envs
-import rl_mpc_deploy as deploy
+import cells
 
-X0 = np.array([0.8, 0.3, 100.14, 100.0])  # mol/l, mol/l, degC, degC
-CONTROLLERS = ("actor", "robust_mpc", "rl_mpc")
+import rl_mpc_deploy as deploy
+from envs import cstr
+
+CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args)
+    "actor": ("actor", dict(critic=HERE / "pretrained/cstr_robust.pt")),
+    "robust_mpc": ("robust_mpc", {}),
+    "rl_mpc": ("rl_mpc", {}),
+    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard")),
+}
+deploy.LABELS["rl_mpc_hard"], deploy.STYLES["rl_mpc_hard"] = "RL+MPC, hard constraints", ("#56B4E9", (0, (5, 1, 1, 1)))
 
 
 @dataclass
@@ -31,6 +39,8 @@ class Args:
     """the plant's activation-energy factor"""
     beta: float = 1.0
     """the plant's rate factor"""
+    start: tuple[float, float, float, float] = (0.8, 0.3, 100.14, 100.0)
+    """c_A, c_B [mol/l], T_R, T_K [degC]"""
     steps: int = 100
     """sampling times"""
     quick: bool = False
@@ -41,41 +51,30 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
+def profile(name, args):
+    """Rows of one controller's closed loop; the last action is held for the last row."""
+    kind, options = CONTROLLERS[name]
+    settings = deploy.Args(goal=(args.goal,), **options)
+    controller = deploy.build_controller(kind, settings)
+    psi, steps = np.array([args.alpha, args.beta]), 5 if args.quick else args.steps
+    x, u, row = deploy.run_episode(controller, cstr, np.array(args.start), psi, controller.goal, steps)
+    print(name, {key: round(float(value), 2) for key, value in row.items()})
+    head = {"controller": name, "horizon": getattr(controller, "horizon", 0), "goal": args.goal, "alpha": args.alpha, "beta": args.beta}
+    return [head | {"step": t} | dict(zip(cstr.STATE_NAMES + cstr.ACTION_NAMES, [*x[t], *u[min(t, steps - 1)]])) for t in range(steps + 1)]
+
+
 def main(args):
-    plant = envs.load("cstr")
-    settings = deploy.Args(goal=(args.goal,), steps=5 if args.quick else args.steps)
-    table, names = args.out / "results/cstr_profile.csv", [*plant.STATE_NAMES, *plant.ACTION_NAMES]
+    cells.check(args, "cstr_profile.csv", goal=(0.1, 2), alpha=(0.5, 1.5), beta=(0.1, 10), steps=(1, 10**5))
+    table, columns = args.out / "results/cstr_profile.csv", cstr.STATE_NAMES + cstr.ACTION_NAMES
     if not args.plot_only:
-        table.parent.mkdir(parents=True, exist_ok=True)
-        with open(table, "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["controller", "horizon", "goal", "alpha", "beta", "step", *names])
-            for name in CONTROLLERS:
-                controller = deploy.build_controller(name, settings)
-                x, u, row = deploy.run_episode(controller, plant, X0, np.array([args.alpha, args.beta]), controller.goal, settings.steps)
-                print(name, {key: round(float(value), 2) for key, value in row.items()})
-                for t in range(settings.steps + 1):  # the last action is held for the last row
-                    writer.writerow(
-                        [
-                            name,
-                            getattr(controller, "horizon", 0),
-                            args.goal,
-                            args.alpha,
-                            args.beta,
-                            t,
-                            *x[t],
-                            *u[min(t, settings.steps - 1)],
-                        ]
-                    )
-    with open(table, newline="") as file:
-        rows = list(csv.DictReader(file))
-    paths = {}
+        cells.write([row for name in CONTROLLERS for row in profile(name, args)], table)
+    rows, paths = cells.read(table), {}
     for name in CONTROLLERS:
-        values = np.array([[float(row[column]) for column in names] for row in rows if row["controller"] == name])
+        values = np.array([[float(row[column]) for column in columns] for row in rows if row["controller"] == name])
         paths[name] = values[None, :, :4], values[None, :-1, 4:]
-    (args.out / "figures").mkdir(exist_ok=True)
-    deploy.figure(plant, deploy.Args(steps=len(values) - 1), rows, paths, [float(rows[0]["goal"])], args.out / "figures/cstr_profile.png")
+    (args.out / "figures").mkdir(parents=True, exist_ok=True)
+    deploy.figure(cstr, deploy.Args(steps=len(values) - 1), rows, paths, [float(rows[0]["goal"])], args.out / "figures/cstr_profile.png")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -21,7 +21,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import tyro
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import trim_mean
 from tqdm import tqdm
 
 matplotlib.use("Agg")
@@ -86,11 +86,6 @@ def collect(args):
             writer.writerows(table)
 
 
-def iqm(values, axis=-1):
-    """Interquartile mean, computed as rliable does: without the lowest and the highest quarter, rounded down to whole seeds."""
-    return trim_mean(values, 0.25, axis=axis)
-
-
 def plot(args):
     with open(args.out / "results/cstr_training.csv") as file:
         curves = list(csv.DictReader(file))
@@ -103,7 +98,14 @@ def plot(args):
             steps = sorted({int(row["step"]) for row in mine})
             values = np.array([[float(row[f"{evaluation}_median_ape"]) for row in mine if int(row["step"]) == step] for step in steps])
             steps = np.array(steps) / 1000
-            ax.plot(steps, iqm(values), color=colour, lw=2, ls="-" if scenarios == "robust" else "--", label=f"{scenarios} agent")
+            ax.plot(
+                steps,
+                trim_mean(values, 0.25, axis=1),
+                color=colour,
+                lw=2,
+                ls="-" if scenarios == "robust" else "--",
+                label=f"{scenarios} agent",
+            )
             ax.fill_between(steps, values.min(1), values.max(1), color=colour, alpha=0.2, lw=0)
         ax.set(yscale="log", xlabel="transitions [thousands]", title=f"{evaluation} evaluation")
         ax.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
@@ -119,10 +121,8 @@ def plot(args):
         mine = [row for row in finals if row["scenarios"] == scenarios]
         for key in ("robust_median_ape", "robust_held_out_median_ape", "nominal_median_ape", "wall_seconds"):
             values = np.array([float(row[key]) for row in mine])
-            low = high = float("nan")
-            if len(values) > 2:
-                low, high = bootstrap((values,), iqm, method="percentile", rng=np.random.default_rng(0)).confidence_interval
-            print(f"{scenarios:8s} {key:28s} {iqm(values):7.2f} [{low:.2f}, {high:.2f}] ({values.min():.2f} ... {values.max():.2f})")
+            middle, low, high = cells.iqm(values)
+            print(f"{scenarios:8s} {key:28s} {middle:7.2f} [{low:.2f}, {high:.2f}] ({values.min():.2f} ... {values.max():.2f})")
 
 
 def main(args):

@@ -1,4 +1,4 @@
-"""The optimal control problem with the conventions of do-mpc and of eq:QMPC as printed, for comparison with the authors' stack."""
+"""The optimal control problem as eq:QMPC is printed, and with the conventions of do-mpc on top, for comparison with the authors' stack."""
 
 import sys
 from pathlib import Path
@@ -10,18 +10,13 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import rl_mpc_deploy as deploy
 
 
-class LiteralMPC(deploy.ScenarioMPC):
-    """Stage cost and soft constraints at x_0 ... x_{N-1}, slack summed over scenarios instead of averaged.
-
-    With N = 1 every term of the terminal cost sees the state under the first scenario, as in do-mpc (read in its source, 4.6.5 to 5.1.2).
-    """
+class PrintedMPC(deploy.ScenarioMPC):
+    """eq:QMPC as printed: stage cost and soft constraints at x_0 ... x_{N-1}, so that nothing bounds the last state but its value."""
 
     def node_cost(self, t, x, goal, slack_cost):
         n = x.shape[1]
         if t < self.horizon:
-            return ca.sum2(slack_cost) + ca.sum2(self.stage_cost.map(n)(x, goal)) / n
-        if t == 1:
-            return self.terminal_cost(x[:, 0], goal[:, 0])
+            return ca.sum2(slack_cost + self.stage_cost.map(n)(x, goal)) / n
         return ca.sum2(self.terminal_cost.map(n)(x, goal)) / n
 
     def _bounds(self, price):
@@ -31,3 +26,16 @@ class LiteralMPC(deploy.ScenarioMPC):
             self.block(bounds["ubx"], name, self.horizon)[p] = 0.0
             self.block(bounds[bound], "box", self.horizon)[p] = no_bound
         return bounds
+
+
+class LiteralMPC(PrintedMPC):
+    """The same with slack summed over scenarios instead of averaged.
+
+    With N = 1 every term of the terminal cost sees the state under the first scenario, as in do-mpc (read in its source, 4.6.5 to 5.1.2).
+    """
+
+    def node_cost(self, t, x, goal, slack_cost):
+        n = x.shape[1]
+        if t == self.horizon == 1:
+            return self.terminal_cost(x[:, 0], goal[:, 0])
+        return super().node_cost(t, x, goal, n * slack_cost)

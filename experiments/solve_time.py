@@ -36,6 +36,7 @@ import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
 
+CRITIC = HERE / "pretrained/cstr_robust.pt"
 CONTROLLERS = {"RL+MPC, N = 1": ("rl_mpc", 1), "RL+MPC, N = 5": ("rl_mpc", 5), "robust MPC, N = 20": ("robust_mpc", 20)}
 HORIZONS, GRIDS = (1, 2, 5, 10, 20), (1, 2, 3, 5, 7)  # grids of k x k parameters
 FUNCTIONS = {"f": "objective", "g": "constraints", "grad_f": "gradient", "jac_g": "Jacobian", "hess_l": "Hessian"}
@@ -131,7 +132,7 @@ def where(args):
     rows = []
     for label, (name, horizon) in CONTROLLERS.items():
         with tempfile.TemporaryDirectory() as folder:
-            settings = deploy.Args(horizon=horizon, compile=not args.quick)
+            settings = deploy.Args(horizon=horizon, critic=CRITIC, compile=not args.quick)
             mpc, steps = clocked(partial(deploy.build_controller, name, settings), Path(folder)), []
             starts, psi = deploy.draws(cstr, args.episodes, args.seed)
             for i in tqdm(range(args.episodes), desc=label, disable=None):
@@ -175,7 +176,7 @@ def scaling(args):
     for axis, n, k in tqdm(todo, desc="scaling", disable=None):
         cstr.SCENARIOS["mpc"] = grid(k)
         try:
-            mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, compile=not args.quick))
+            mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, critic=CRITIC, compile=not args.quick))
         finally:
             cstr.SCENARIOS["mpc"] = shipped
         log = []

@@ -1,0 +1,173 @@
+"""Closed loops of the reactor study: what its scripts share.
+
+A `Loop` names a controller and some of the paired draws; `run` gives a row for each of them. Rows hold the actions, too, so that the oracle
+can start from them; `table` leaves them out.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+from tqdm import tqdm
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+import cells
+import torch
+from literal import LiteralMPC, PrintedMPC
+
+import rl_mpc_deploy as deploy
+from envs import cstr
+
+ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
+INPUTS = [
+    HERE / "cstr_loops.py",
+    HERE / "literal.py",
+    HERE.parent / "rl_mpc_deploy.py",
+    HERE.parent / "envs/__init__.py",
+    Path(cstr.__file__),
+]
+BLOCK = 25  # draws per cell
+
+
+class OneStart(deploy.ScenarioMPC):
+    """Starts each solve from the last plan alone; the actor gives the first guess of an episode."""
+
+    def make_step(self, x0):
+        actor, self.actor = self.actor, self.actor if self.plan is None else None
+        try:
+            return super().make_step(x0)
+        finally:
+            self.actor = actor
+
+
+CLASSES = {"": deploy.ScenarioMPC, "literal": LiteralMPC, "printed": PrintedMPC, "one start": OneStart}
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller (`settings.controllers[0]`) on the draws first ... stop - 1 of `settings.seed`."""
+
+    variant: str
+    """its name in tables"""
+    settings: deploy.Args
+    critic: str
+    """hash of its checkpoint"""
+    first: int
+    stop: int
+    like: str = ""
+    """a key of CLASSES; literal: the authors' conventions, printed: eq:QMPC's sum"""
+    benchmark: tuple = ()
+    """items that replace those of the plant's BENCHMARK"""
+    shift: float | None = None
+    """plants at the edge of the training box times this factor, in place of the evaluation's"""
+
+
+@functools.cache
+def checksum(path):
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
+
+
+def loops(variants, episodes, seed=0, steps=100, **settings):
+    """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}."""
+    own, found = ("like", "benchmark", "shift"), []
+    for first in range(0, episodes, BLOCK):
+        for label, options in variants.items():
+            options = {"horizon": 5} | settings | options
+            args = deploy.Args(seed=seed, steps=steps, jobs=1, **{k: v for k, v in options.items() if k not in own})
+            stop, critic = min(first + BLOCK, episodes), checksum(deploy.critic_path(args))
+            found.append(Loop(label, args, critic, first, stop, **{k: v for k, v in options.items() if k in own}))
+    return found
+
+
+@functools.cache
+def controller(settings, like, benchmark):
+    torch.set_num_threads(1)
+    replaced = {name: np.array(value) if isinstance(value, tuple) else value for name, value in benchmark}
+    with mock.patch.object(deploy, "ScenarioMPC", CLASSES[like]), mock.patch.dict(cstr.BENCHMARK, replaced):
+        return deploy.build_controller(settings.controllers[0], settings)
+
+
+def shifted_plants(episodes, seed, factor):
+    """Plants whose (alpha, beta) lie on the edge of the training box blown up by `factor` about its centre, (episodes, 2); a draw keeps its
+    direction whatever the factor."""
+    found = []
+    for episode in range(episodes):
+        direction = np.random.default_rng([seed, 4, episode]).uniform(-1, 1, size=2)
+        found.append(cstr.PSI_NOMINAL + factor * direction / np.abs(direction).max() * (cstr.SCENARIOS["robust"].max(0) - cstr.PSI_NOMINAL))
+    return np.array(found)
+
+
+def slack(x):
+    """Sum of violations over x_1 ... x_T, physical units (mol/l and degC added up), of a trajectory (T + 1, n_x)."""
+    return np.abs(x - np.clip(x, cstr.X_LOW, cstr.X_HIGH))[1:].sum()
+
+
+def run(loop):
+    """A row per draw: labels, the metrics of rl_mpc_deploy.py, `slack`, and the actions as JSON."""
+    args, mpc = loop.settings, controller(loop.settings, loop.like, loop.benchmark)
+    starts, psi = deploy.draws(cstr, loop.stop, args.seed)
+    if loop.shift is not None:
+        psi = shifted_plants(loop.stop, args.seed, loop.shift)
+    # of a lower bound on a concentration; infinite: hard
+    weight, critic = getattr(mpc, "slack_price", np.zeros((1, 1))), deploy.critic_path(args)
+    head = {"variant": loop.variant, "controller": args.controllers[0], "horizon": getattr(mpc, "horizon", 0),
+            "slack_weight": float(weight[0, 0]), "critic": critic.stem if critic.parent == ROBUST.parent else critic.parent.name,
+            "seed": args.seed}  # fmt: skip
+    rows = []
+    for episode in range(loop.first, loop.stop):
+        x, u, row = deploy.run_episode(mpc, cstr, starts[episode], psi[episode], mpc.goal, args.steps)
+        row = {k: round(float(v), 6) if isinstance(v, float) else v for k, v in row.items()}
+        rows.append(head | {"episode": episode, "psi": json.dumps(psi[episode].tolist())} | row
+                    | {"slack": round(float(slack(x)), 6), "actions": json.dumps(u.tolist())})  # fmt: skip
+    return rows
+
+
+def collect(variants, args, episodes, **settings):
+    """Rows of every variant, variant by variant, each finished block kept under `args.runs`."""
+    rows = cells.collect(run, loops(variants, episodes, **settings), args.jobs, args.runs, INPUTS)
+    return [row for label in variants for row in rows if row["variant"] == label]
+
+
+def table(rows):
+    """Rows for a committed table."""
+    return [{k: v for k, v in row.items() if k != "actions"} for row in rows]
+
+
+def train(agents, args):
+    """Checkpoints of agents (seed, argument, argument, ...) of sac_her_branching.py on the reactor; only missing ones are trained."""
+    code = [HERE.parent / name for name in ("sac_her_branching.py", "envs/__init__.py", "envs/cstr.py")]
+
+    def one(agent):
+        seed, *flags = map(str, agent)
+        version = hashlib.sha256(b"".join(path.read_bytes() for path in code) + repr((flags, args.quick)).encode()).hexdigest()[:8]
+        final = args.runs / f"agents/{version}_{seed}"
+        if not (final / "checkpoint.pt").exists():
+            command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--seed", seed, "--eval-every", "0", "--save-every", "0"]
+            command += ["--out", str(final / "run"), *(["--total-timesteps", "2000"] if args.quick else []), *flags]
+            subprocess.run(command, check=True, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+            max(final.glob("run/*/checkpoint.pt"), key=lambda path: path.stat().st_mtime).replace(final / "checkpoint.pt")
+        return final / "checkpoint.pt"
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        return list(tqdm(pool.map(one, agents), total=len(agents), unit="agent", disable=None))
+
+
+def replay(row):
+    """States (T + 1, n_x) of a closed loop, from its actions."""
+    x, psi = [deploy.draws(cstr, int(row["episode"]) + 1, int(row["seed"]))[0][int(row["episode"])]], np.array(json.loads(row["psi"]))
+    for u in json.loads(row["actions"]):
+        x.append(cstr.step(x[-1], np.array(u), psi))
+    return np.array(x)
+
+
+def values(rows, variant, key):
+    return np.array([float(row[key]) for row in rows if row["variant"] == variant])
