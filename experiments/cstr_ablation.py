@@ -80,8 +80,7 @@ def plant_data(critic, args):
     """A trajectories.npz of RL+MPC with this critic in its loops on draws of another seed; returns its path."""
     path = args.runs / f"plant_data_{loops.checksum(critic)}{'_quick' if args.quick else ''}.npz"
     if not path.exists():
-        settings = dict(seed=args.seed + 1000, steps=3 if args.quick else 100)
-        rows = loops.collect({"data": RL_MPC | dict(critic=critic)}, args, 2 if args.quick else 64, **settings)
+        rows = loops.collect({"data": RL_MPC | dict(critic=critic)}, args, episodes=64, seed=args.seed + 1000)
         x, u = np.stack([loops.replay(row) for row in rows]), np.stack([json.loads(row["actions"]) for row in rows])
         np.savez_compressed(path, rl_mpc_x=x, rl_mpc_u=u)
     return path
@@ -102,7 +101,7 @@ def collect(args):
         variants |= {(label, seed): dict(critic=path) | options for seed, path in zip(seeds, default)}
     # a critic blind to constraints is planned with at the default's slack weight, too
     named = {f"{label} | {seed}": RL_MPC | dict(slack_weight=2.0) | options for (label, seed), options in variants.items()}
-    for row in loops.table(loops.collect(named, args, 2 if args.quick else args.episodes, seed=args.seed, steps=3 if args.quick else 100)):
+    for row in loops.table(loops.collect(named, args)):
         label, seed = row["variant"].split(" | ")
         rows.append({"agent": seed} | row | {"variant": label})
     return rows

@@ -136,8 +136,7 @@ def main(args):
     cells.check(args, f"{name}.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     table = args.out / f"results/{name}.csv"
     if not args.plot_only:
-        episodes = 2 if args.quick else args.episodes or (200 if args.study == "deploy" else 50)
-        rows = loops.collect(variants(args), args, episodes, seed=args.seed, steps=3 if args.quick else 100)
+        rows = loops.collect(variants(args), args, args.episodes or (200 if args.study == "deploy" else 50))
         cells.write(loops.table(rows), table)
     rows = cells.read(table)
     print_table(rows)

@@ -116,8 +116,7 @@ def main(args):
     if not args.plot_only:
         variants = {f"{label}, slack weight {weight:g}": options | dict(slack_weight=weight) for label, (_, _, options) in CURVES.items()
                     for weight in (WEIGHTS[:2] if args.quick else WEIGHTS)}  # fmt: skip
-        rows = loops.collect(variants, args, 2 if args.quick else args.episodes, seed=args.seed, steps=3 if args.quick else 100)
-        cells.write(loops.table(rows), args.out / "results/cstr_frontier.csv")
+        cells.write(loops.table(loops.collect(variants, args)), args.out / "results/cstr_frontier.csv")
     plot(args)
 
 

@@ -76,13 +76,14 @@ def checksum(path):
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
 
 
-def loops(variants, episodes, seed=0, steps=100, **settings):
-    """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}."""
+def loops(variants, episodes, seed, quick=False):
+    """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}. Quick: 2 draws of 3 steps, not compiled."""
     own, found = ("like", "benchmark", "shift"), []
+    episodes, steps = (2, 3) if quick else (episodes, 100)
     for first in range(0, episodes, BLOCK):
         for label, options in variants.items():
-            options = {"horizon": 5} | settings | options
-            args = deploy.Args(seed=seed, steps=steps, jobs=1, **{k: v for k, v in options.items() if k not in own})
+            options = {"horizon": 5, "seed": seed, "steps": steps, "jobs": 1, "compile": not quick} | options
+            args = deploy.Args(**{k: v for k, v in options.items() if k not in own})
             stop, critic = min(first + BLOCK, episodes), checksum(deploy.critic_path(args))
             found.append(Loop(label, args, critic, first, stop, **{k: v for k, v in options.items() if k in own}))
     return found
@@ -131,9 +132,10 @@ def run(loop):
     return rows
 
 
-def collect(variants, args, episodes, **settings):
+def collect(variants, args, episodes=None, seed=None):
     """Rows of every variant, variant by variant, each finished block kept under `args.runs`."""
-    rows = cells.collect(run, loops(variants, episodes, **settings), args.jobs, args.runs, INPUTS)
+    episodes, seed = episodes or args.episodes, args.seed if seed is None else seed
+    rows = cells.collect(run, loops(variants, episodes, seed, args.quick), args.jobs, args.runs, INPUTS)
     return [row for label in variants for row in rows if row["variant"] == label]
 
 

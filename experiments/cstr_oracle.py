@@ -74,11 +74,11 @@ def known_plant():
 class Oracle(deploy.ScenarioMPC):
     """The problem over a whole episode; the plan is replayed on the plant, so that its figures are those of a controller's row."""
 
-    def __init__(self, steps):
+    def __init__(self, steps, compile):
         x, goal = ca.MX.sym("x", N_X + N_PSI), ca.MX.sym("goal", 1)
         near = ca.exp(-ca.sumsqr(x[cstr.GOAL_INDEX] - goal) / (2 * deploy.METRIC_SIGMA2))
         stage = ca.Function("stage", [x, goal], [-near])
-        super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, robust_horizon=0)
+        super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, robust_horizon=0, compile=compile)
 
     def solve(self, x0, psi, weight, guess):
         """Actions (steps, n_u) that one solve from the actions `guess`, or from the held state (None), ends with; None if it fails."""
@@ -93,7 +93,7 @@ class Oracle(deploy.ScenarioMPC):
 
 @functools.cache
 def oracle(steps):
-    return Oracle(steps)
+    return Oracle(steps, compile=steps > 3)
 
 
 def measure(x0, psi, u):
@@ -144,7 +144,7 @@ def collect(args):
     """The oracle's rows and those of every controller."""
     episodes, steps = (2, 3) if args.quick else (args.episodes, 100)
     variants = cstr_deploy.STUDIES["deploy"]
-    controllers = loops.collect(variants, args, episodes, seed=args.seed, steps=steps)  # found in args.runs if cstr_deploy.py has run
+    controllers = loops.collect(variants, args)  # found in args.runs if cstr_deploy.py has run
     oracle(steps)  # compiled before the processes fork
     jobs = []
     for episode in range(episodes):

@@ -78,7 +78,7 @@ def plants(args):
     variants = {
         f"{label} | {factor:g}": options | dict(shift=factor) for label, (_, _, options) in CONTROLLERS.items() for factor in factors
     }
-    rows = loops.collect(variants, args, 2 if args.quick else args.episodes, seed=args.seed, steps=3 if args.quick else 100)
+    rows = loops.collect(variants, args)
     return [{"factor": row["variant"].split(" | ")[1]} | row | {"variant": row["variant"].split(" | ")[0]} for row in loops.table(rows)]
 
 
@@ -139,11 +139,10 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
 
 def critic(args):
     """A row per state visited in the closed loops of the actor and of RL+MPC at N = 5: learned and simulated value."""
-    episodes, steps = (2, 3) if args.quick else (args.episodes, 100)
     rows = []
     for name, path in CRITICS.items():
         variants = {"actor": ACTOR | dict(critic=path), "RL+MPC, N = 5": RL_MPC | dict(critic=path)}
-        loop_rows = loops.collect(variants, args, episodes, seed=args.seed, steps=steps)
+        loop_rows = loops.collect(variants, args)
         value = deploy.load_critic(path, "cstr").value
         for label in variants:
             rng, found = np.random.default_rng(args.seed), []

@@ -366,6 +366,17 @@ def test_horizon_zero_and_hard_constraints_from_the_command_line(checkpoint, tmp
         assert row["horizon"] == str(extra[1])
 
 
+def test_the_slack_weight_follows_the_critic(checkpoint, tmp_path):
+    """1, as in the paper, with a critic that is blind to constraints, 2 with one that is not; what the command line says goes first."""
+    data = torch.load(checkpoint, weights_only=True)
+    torch.save(data | {"args": data["args"] | {"constraint_weight": 3.0}}, tmp_path / "aware.pt")
+    for path, given, wanted in ((checkpoint, None, 1.0), (tmp_path / "aware.pt", None, 2.0), (tmp_path / "aware.pt", 5.0, 5.0)):
+        controller = deploy.build_controller("rl_mpc", deploy.Args(critic=path, horizon=1, slack_weight=given, compile=False))
+        assert (controller.slack_price == wanted).all()
+    assert deploy.critic_path(deploy.Args()).name == "cstr_constrained.pt"
+    assert deploy.critic_path(deploy.Args(env="linear")).name == "linear_robust.pt"
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [

@@ -13,7 +13,6 @@ import pytest
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = {
     "cstr_training": ["cstr_training.csv", "cstr_training_seeds.csv"],
-    "cstr_deploy": ["cstr_deploy.csv"],
     "cstr_profile": ["cstr_profile.csv"],
     "dip_performance": ["dip_performance.csv"],
     "dip_equilibria": ["dip_equilibria.csv", "dip_profile.csv"],
@@ -39,8 +38,38 @@ LINEAR_FIGURES = {
 }
 LINEAR_STUDIES = [("linear_scalability", "main"), ("linear_scalability", "sweep")]
 LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distance", "scaling")]
+REACTOR = [  # script, study, tables, figures; in this order
+    ("cstr_deploy", None, ["cstr_deploy"], ["cstr_deploy", "cstr_deploy_full"]),
+    ("cstr_deploy", "critics", ["cstr_critics"], ["cstr_critics"]),
+    ("cstr_deploy", "literal", ["cstr_literal"], ["cstr_literal"]),
+    ("cstr_deploy", "expansion", ["cstr_expansion"], ["cstr_expansion"]),
+    ("cstr_oracle", None, ["cstr_oracle", "cstr_oracle_gap"], []),
+    ("cstr_frontier", None, ["cstr_frontier"], ["cstr_frontier"]),
+    ("cstr_ablation", None, ["cstr_ablation"], ["cstr_ablation"]),
+    ("cstr_shift", None, ["cstr_shift"], ["cstr_shift"]),
+    ("cstr_shift", "critic", ["cstr_shift_critic"], ["cstr_shift_critic"]),
+    ("cstr_tune", None, ["cstr_tune"], []),
+    ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
+    ("cstr_offline", "ablation", ["cstr_offline_ablation"], ["cstr_offline_ablation"]),
+]
 NO_RUNS = {"cstr_profile", "dip_equilibria", "solve_time"}  # too short to be kept in parts
-TEXT = {"env", "variant", "scenarios", "machine", "controller", "critic", "psi", "objective", "equilibrium", "axis", "part"}
+TEXT = {
+    "env",
+    "variant",
+    "agent",
+    "evaluation",
+    "found_from",
+    "visited_by",
+    "scenarios",
+    "machine",
+    "controller",
+    "critic",
+    "psi",
+    "objective",
+    "equilibrium",
+    "axis",
+    "part",
+}
 
 
 def run(name, *arguments):
@@ -55,7 +84,8 @@ def check_table(table, folder):
     committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
     assert rows and list(rows[0]) == list(committed[0])
     for row in rows + committed:
-        assert all(np.isfinite(float(value)) for key, value in row.items() if key not in TEXT)
+        # the weight of a hard bound is infinite
+        assert all(np.isfinite(float(value)) for key, value in row.items() if key not in TEXT and (key, value) != ("slack_weight", "inf"))
         assert "psi" not in row or len(json.loads(row["psi"])) == 2
 
 
@@ -155,11 +185,67 @@ def test_the_animation_is_small_enough_for_the_readme():
     assert (ROOT / "experiments/figures/dip_profile.gif").stat().st_size < 2e6
 
 
-@pytest.mark.parametrize("study", ["value", "expansion"])
-def test_studies_of_the_value(study, tmp_path):
+def test_reactor_study(tmp_path):
+    """Its scripts build on each other; a second call of the first finds everything done."""
+    keep = ["--quick", "--out", tmp_path, "--runs", tmp_path / "runs"]
+    for name, study, _, _ in REACTOR:
+        run(name, *(["--study", study] if study else []), *keep)
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("*.csv")}
+    run("cstr_deploy", *keep)
+    assert kept == {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("*.csv")}
+    for _, _, tables, figures in REACTOR:
+        for table in tables:
+            check_table(f"{table}.csv", tmp_path)
+        assert all((tmp_path / f"figures/{figure}.png").stat().st_size > 10_000 for figure in figures)
+
+
+@pytest.mark.parametrize("name, study, tables, figures", REACTOR)
+def test_reactor_figures_are_drawn_from_the_committed_tables(name, study, tables, figures, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
-    run("cstr_deploy", "--study", study, "--plot-only", "--out", tmp_path)
-    assert (tmp_path / f"figures/cstr_{study}.png").stat().st_size > 10_000
+    run(name, *(["--study", study] if study else []), "--plot-only", "--out", tmp_path)
+    assert all((tmp_path / f"figures/{figure}.png").stat().st_size > 10_000 for figure in figures)
+
+
+def test_the_oracle_is_no_worse_than_any_controller():
+    """In its own objective, but for local optima, which the table counts and which are few."""
+    for row in csv.DictReader(open(ROOT / "experiments/results/cstr_oracle_gap.csv")):
+        assert int(row["negative"]) <= 0.01 * int(row["draws"]), row
+    found = list(csv.DictReader(open(ROOT / "experiments/results/cstr_oracle.csv")))
+    for row in found:
+        weight, slack = float(row["weight"]), float(row["slack"])
+        assert float(row["objective"]) == pytest.approx(float(row["time_near_goal"]) - weight * slack, abs=1e-4)
+
+
+def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
+    sys.path.insert(0, str(ROOT / "experiments"))
+    import cstr_oracle
+
+    from envs import cstr
+
+    problem, x0, psi = cstr_oracle.Oracle(20, compile=False), np.array([0.8, 0.4, 120.0, 118.0]), np.array([1.02, 0.95])
+    guess = np.tile([20.0, -2000.0], (20, 1))
+    u = problem.solve(x0, psi, 5.0, guess)
+    assert ((cstr.U_LOW - 1e-6 <= u) & (u <= cstr.U_HIGH + 1e-6)).all()
+    (near, _, slack), (near_guess, _, slack_guess) = (cstr_oracle.measure(x0, psi, actions) for actions in (u, guess))
+    assert near - 5 * slack > near_guess - 5 * slack_guess
+    assert -problem.last_objective == pytest.approx(near - 5 * slack, abs=1e-4)  # the model is the plant
+
+
+def test_a_critic_per_scenario_equals_twin_critics_one_by_one():
+    """cstr_offline.py's critics, all evaluated at once, against TwinCritic for each pair."""
+    sys.path.insert(0, str(ROOT / "experiments"))
+    import cstr_offline
+    import torch
+
+    network = dict(n_in=5, n_u=2, hidden=[8, 8])
+    many, z, a = cstr_offline.ManyCritics(3, **network), torch.randn(3, 4, 5), torch.randn(3, 4, 2)
+    together, alone = many.each(z, a), many.each(z[0], a[0])
+    for i in range(3):
+        twin = cstr_offline.sac.TwinCritic(**network)
+        twin.load_state_dict({k: v[2 * i : 2 * i + 2] for k, v in many.state_dict().items()})
+        torch.testing.assert_close(together[i], twin(z[i], a[i]))
+        torch.testing.assert_close(alone[i], twin(z[0], a[0]))
+    torch.testing.assert_close(many(z[0], a[0]), alone.mean(0))
 
 
 def test_shipped_critics_are_the_first_seed_of_the_committed_table():

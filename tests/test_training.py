@@ -247,6 +247,45 @@ def test_command_line_end_to_end(tmp_path):
             "eval/robust_median_ape", "eval/nominal_median_ape"} <= set(events.Tags()["scalars"])  # fmt: skip
 
 
+def test_episodes_of_a_plant_enter_the_buffer_as_if_stepped(plant):
+    """Seven closed loops into a buffer of three plants: all transitions, their goals, and hindsight goals of the same episode alone."""
+    rng = np.random.default_rng(0)
+    x, u, goal = rng.normal(size=(7, 5, 4)), rng.normal(size=(7, 4, 2)), rng.normal(size=(7, 1))
+    buffer = training.HERBuffer(300, 3, 4, 2, 1, plant.GOAL_INDEX, 1, "future", 0.5)
+    buffer.add_episodes(x, u, goal)
+    assert buffer.now == 3 * 4  # three rows of plants
+    assert (buffer.end[: buffer.now] < buffer.OPEN).all()
+    s, a, g, s_next = buffer.sample(400, torch.Generator().manual_seed(0))
+    found, relabelled = set(), 0
+    for i in range(400):
+        episode, t = np.argwhere(np.isclose(x[:, :-1], s[i], atol=1e-5).all(-1))[0]
+        np.testing.assert_allclose(a[i], u[episode, t], atol=1e-5)
+        np.testing.assert_allclose(s_next[i, 0], x[episode, t + 1], atol=1e-5)
+        later = np.append(x[episode, t + 1 :, plant.GOAL_INDEX[0]], goal[episode])
+        assert np.isclose(later, g[i].item(), atol=1e-5).any()
+        relabelled += not np.isclose(goal[episode, 0], g[i].item(), atol=1e-5)
+        found.add(episode)
+    assert found == set(range(7)) and 150 < relabelled < 250
+
+
+def test_plant_data_from_the_command_line(tmp_path):
+    x, u = np.full((2, 4, 4), 1.0) * [1, 1, 100, 100], np.full((2, 3, 2), [50.0, -1000.0])
+    np.savez(tmp_path / "trajectories.npz", rl_mpc_x=x, rl_mpc_u=u, actor_x=x, actor_u=u)
+    arguments = ["--total-timesteps", 320, "--learning-starts", 160, "--eval-episodes", 5, "--num-envs", 8]
+    out = run_script(*arguments, "--add-plant-data", tmp_path / "trajectories.npz", "--out", tmp_path / "run")
+    assert out.returncode == 0, out.stderr
+    (resume,) = tmp_path.glob("run/*/resume.pt")
+    state = torch.load(resume, weights_only=True)
+    assert state["buffer"]["now"] == 3 + 320 // 8  # four episodes of three steps in one row of eight plants
+    out = run_script("--resume", resume)  # finished: evaluates nothing anew, and does not add the data twice
+    assert torch.load(resume, weights_only=True)["buffer"]["now"] == 3 + 320 // 8
+    np.savez(tmp_path / "bad.npz", rl_mpc_x=x[:, :2], rl_mpc_u=u)
+    for path, words in ((tmp_path / "bad.npz", "not a trajectories.npz"), (tmp_path / "no.npz", "does not exist"), ("README.md", "not a")):
+        out = run_script("--add-plant-data", path, "--out", tmp_path / "none")
+        assert out.returncode == 2 and "Traceback" not in out.stderr and words in out.stderr
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -262,6 +301,7 @@ def test_command_line_end_to_end(tmp_path):
         (["--resume", "README.md", "--seed", "1"], ["--resume", "no others"]),
         (["--out", "README.md/runs"], ["--out", "cannot write"]),
         (["--scenarios", "all"], ["scenarios", "robust"]),
+        (["--branches", "2", "--add-plant-data", "x.npz"], ["--branches", "2", "--add-plant-data"]),
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(arguments, words):
