@@ -33,19 +33,19 @@ import rl_mpc_deploy as deploy
 
 PAPER, AWARE = dict(critic=loops.ROBUST), dict(critic=loops.CONSTRAINED)
 ACTOR, RL_MPC = dict(controllers=("actor",)), dict(controllers=("rl_mpc",))
-TUNED = cstr_tune.settings(prices=(0.1, 1.0), change=0.1, horizon=20)  # best of cstr_tune.py
+TUNED = cstr_tune.settings(prices=(0.1, 1.0), change=0.1, horizon=40)  # best of cstr_tune.py
 HORIZONS = (0, 1, 2, 5, 10)
 STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
     "deploy": {
         "nominal MPC, N = 20": dict(controllers=("nominal_mpc",)),
         "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
-        "robust MPC, tuned": dict(controllers=("robust_mpc",), benchmark=TUNED),
-        "goal-conditioned MPC, N = 5": dict(controllers=("goal_mpc",), **AWARE),
+        "robust MPC, tuned, N = 40": dict(controllers=("robust_mpc",), benchmark=TUNED),
+        "goal-conditioned MPC, N = 5": dict(controllers=("goal_mpc",), slack_weight=2.0),
         "RL, paper's": ACTOR | PAPER,
         **{f"RL+MPC, paper's, N = {n}": RL_MPC | PAPER | dict(horizon=n) for n in HORIZONS},
         "RL, constraint-aware": ACTOR | AWARE,
         **{f"RL+MPC, constraint-aware, N = {n}": RL_MPC | AWARE | dict(horizon=n) for n in HORIZONS},
-        "the same, N = 5, hard constraints": RL_MPC | AWARE | dict(constraints="hard"),
+        "RL+MPC, constraint-aware, N = 5, hard": RL_MPC | AWARE | dict(constraints="hard"),
     },
     "literal": {
         f"{title}, N = {n}": RL_MPC | PAPER | dict(horizon=n) | options
@@ -62,7 +62,7 @@ STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
         for title, value in {"exact value": "exact", "expanded at the settled state": "taylor", "re-expanded": "taylor-local"}.items()
     },
 }
-MAIN = ["robust MPC, N = 20", "robust MPC, tuned", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
+MAIN = ["robust MPC, N = 20", "robust MPC, tuned, N = 40", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
         "RL+MPC, constraint-aware, N = 5"]  # fmt: skip
 KINDS = {"paper's": (), "constraint-aware": ("--constraint-weight", "3")}  # of agents, how they are trained
 MEASURES = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
@@ -101,11 +101,11 @@ def variants(args):
 
 
 def print_table(rows):
-    print(f"{'':37s}{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}{'solve ms':>16s}{'failed':>8s}")
+    print(f"{'':40s}{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}{'solve ms':>16s}{'failed':>8s}")
     titles = f"{'median':>9s}{'5 %-ile':>8s}{'worst':>8s}"
-    print(f"{'':37s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'solves':>8s}")
+    print(f"{'':40s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'solves':>8s}")
     for label in dict.fromkeys(row["variant"] for row in rows):
-        text = f"{label:37s}"
+        text = f"{label:40s}"
         for key in MEASURES:
             found = loops.values(rows, label, key)
             text += f"{np.median(found):9.1f}{np.quantile(found, 0.05):8.1f}{found.min():8.1f}   "

@@ -36,10 +36,13 @@ CURVES = {  # label: (colour, marker, keywords of cstr_loops)
 POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
     "nominal MPC, N = 20": ("#999999", "P", "nominal MPC"),
     "robust MPC, N = 20": ("black", "X", "robust MPC"),
-    "robust MPC, tuned": ("black", "*", "robust MPC, tuned"),
+    "robust MPC, tuned, N = 40": ("black", "*", "robust MPC, tuned, N = 40"),
     "goal-conditioned MPC, N = 5": ("#E69F00", "P", "goal-conditioned MPC, N = 5"),
     "RL, constraint-aware": ("#D55E00", "^", "RL, constraint-aware"),
+    "RL+MPC, constraint-aware, N = 0": ("#009E73", "P", "RL+MPC, N = 0"),
+    "RL+MPC, constraint-aware, N = 5, hard": ("#009E73", "*", "RL+MPC, N = 5, hard"),
     "RL, paper's": ("#D55E00", "v", "RL, paper's"),
+    "RL+MPC, paper's, N = 0": ("#CC79A7", "P", "RL+MPC, N = 0, paper's critic"),
 }
 
 
@@ -48,7 +51,7 @@ class Args:
     episodes: int = 50
     """paired draws, at most as many as cstr_deploy.py had"""
     seed: int = 0
-    """seed of the draws"""
+    """seed of the draws, that of cstr_deploy.py and cstr_oracle.py"""
     jobs: int = 2
     """processes"""
     quick: bool = False
@@ -69,7 +72,7 @@ def summary(rows):
 
 def plot(args):
     rows = cells.read(args.out / "results/cstr_frontier.csv")
-    draws = {row["episode"] for row in rows}
+    draws = {(row["seed"], row["episode"]) for row in rows}
     fig, axes = plt.subplots(1, 2, figsize=(10, 5.2), layout="constrained")
     for ax, title in zip(axes, ("medians", "5th percentiles")):
         ax.set(xlabel="time outside constraints [steps], 0 is best", ylabel="time near goal [steps]", title=title)
@@ -87,7 +90,7 @@ def plot(args):
             text = f"{label}{', slack weight ' if name else ''}{name}"
             print(f"{text:46s}{near:14.1f}{near_low:9.1f}{outside:18.1f}{outside_low:9.1f}")
 
-    oracle = [row for row in cells.read(args.out / "results/cstr_oracle.csv") if row["episode"] in draws]
+    oracle = [row for row in cells.read(args.out / "results/cstr_oracle.csv") if (row["seed"], row["episode"]) in draws]
     by_weight = {}
     for row in oracle:
         by_weight.setdefault(row["weight"], []).append(row)
@@ -99,7 +102,7 @@ def plot(args):
             if row["variant"].rpartition(", slack weight ")[0] == label:
                 groups.setdefault(row["slack_weight"], []).append(row)
         draw(groups.values(), label, colour, marker, [f"{float(weight):g}" for weight in groups])
-    controllers = [row for row in cells.read(args.out / "results/cstr_deploy.csv") if row["episode"] in draws]
+    controllers = [row for row in cells.read(args.out / "results/cstr_deploy.csv") if (row["seed"], row["episode"]) in draws]
     for variant, (colour, marker, label) in POINTS.items():
         draw([[row for row in controllers if row["variant"] == variant]], label, colour, marker, ls="none")
     handles, labels = axes[0].get_legend_handles_labels()

@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
 
@@ -21,25 +21,21 @@ from tqdm import tqdm
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
+import literal
 import torch
-from literal import LiteralMPC, PrintedMPC
 
+import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
-INPUTS = [
-    HERE / "cstr_loops.py",
-    HERE / "literal.py",
-    HERE.parent / "rl_mpc_deploy.py",
-    HERE.parent / "envs/__init__.py",
-    Path(cstr.__file__),
-]
+# what rows depend on, read when it is imported: an edit while loops run does not file old results under new code
+INPUTS = [Path(module).read_bytes() for module in (__file__, literal.__file__, deploy.__file__, envs.__file__, cstr.__file__)]
 BLOCK = 25  # draws per cell
 
 
 class OneStart(deploy.ScenarioMPC):
-    """Starts each solve from the last plan alone; the actor gives the first guess of an episode."""
+    """Starts each solve from the shifted last plan alone: the actor gives the first guess of an episode, and is no fallback after it."""
 
     def make_step(self, x0):
         actor, self.actor = self.actor, self.actor if self.plan is None else None
@@ -49,7 +45,7 @@ class OneStart(deploy.ScenarioMPC):
             self.actor = actor
 
 
-CLASSES = {"": deploy.ScenarioMPC, "literal": LiteralMPC, "printed": PrintedMPC, "one start": OneStart}
+CLASSES = {"": deploy.ScenarioMPC, "literal": literal.LiteralMPC, "printed": literal.PrintedMPC, "one start": OneStart}
 
 
 @dataclass(frozen=True)
@@ -58,9 +54,9 @@ class Loop:
 
     variant: str
     """its name in tables"""
-    settings: deploy.Args
-    critic: str
-    """hash of its checkpoint"""
+    settings: deploy.Args = field(repr=False)
+    key: str
+    """the settings, with the checkpoint's hash in place of its path: cells are told apart by their repr"""
     first: int
     stop: int
     like: str = ""
@@ -84,8 +80,9 @@ def loops(variants, episodes, seed, quick=False):
         for label, options in variants.items():
             options = {"horizon": 5, "seed": seed, "steps": steps, "jobs": 1, "compile": not quick} | options
             args = deploy.Args(**{k: v for k, v in options.items() if k not in own})
-            stop, critic = min(first + BLOCK, episodes), checksum(deploy.critic_path(args))
-            found.append(Loop(label, args, critic, first, stop, **{k: v for k, v in options.items() if k in own}))
+            key = f"{checksum(deploy.critic_path(args))} {replace(args, critic=None)}"
+            stop = min(first + BLOCK, episodes)
+            found.append(Loop(label, args, key, first, stop, **{k: v for k, v in options.items() if k in own}))
     return found
 
 

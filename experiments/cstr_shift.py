@@ -39,10 +39,13 @@ from envs import cstr
 
 FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0)
 CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)
+    "nominal MPC, N = 20": ("#999999", ":", dict(controllers=("nominal_mpc",))),
     "robust MPC, N = 20": ("#0072B2", "-.", dict(controllers=("robust_mpc",))),
-    "robust MPC, tuned": ("#56B4E9", (0, (5, 1)), dict(controllers=("robust_mpc",), benchmark=TUNED)),
+    "robust MPC, tuned, N = 40": ("#56B4E9", (0, (5, 1)), dict(controllers=("robust_mpc",), benchmark=TUNED)),
+    "goal-conditioned MPC, N = 5": ("#E69F00", (0, (3, 1, 1, 1)), dict(controllers=("goal_mpc",), slack_weight=2.0)),
+    "RL, paper's": ("#CC79A7", "--", ACTOR | PAPER),
     "RL, constraint-aware": ("#D55E00", "--", ACTOR | AWARE),
-    "RL+MPC, paper's, N = 5": ("#CC79A7", ":", RL_MPC | PAPER),
+    "RL+MPC, paper's, N = 5": ("#CC79A7", "-", RL_MPC | PAPER),
     "RL+MPC, constraint-aware, N = 5": ("#009E73", "-", RL_MPC | AWARE),
 }
 CRITICS = {"paper's": loops.ROBUST, "constraint-aware": loops.CONSTRAINED}
@@ -105,7 +108,8 @@ def plot_plants(rows, path):
         ax.grid(alpha=0.3)
     axes[2].set_yscale("log")
     axes[2].yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    title = "thick: median; thin: 5th percentile (offset: 95th)"
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9, title=title)
     fig.savefig(path, dpi=150)
 
 
@@ -139,14 +143,14 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
 
 def critic(args):
     """A row per state visited in the closed loops of the actor and of RL+MPC at N = 5: learned and simulated value."""
-    rows = []
+    kinds = {"actor": ACTOR, "RL+MPC, N = 5": RL_MPC}
+    variants = {name: {label: kind | dict(critic=path) for label, kind in kinds.items()} for name, path in CRITICS.items()}
+    visited, rows = {name: loops.collect(own, args) for name, own in variants.items()}, []  # before torch computes: no fork after it
     for name, path in CRITICS.items():
-        variants = {"actor": ACTOR | dict(critic=path), "RL+MPC, N = 5": RL_MPC | dict(critic=path)}
-        loop_rows = loops.collect(variants, args)
         value = deploy.load_critic(path, "cstr").value
-        for label in variants:
+        for label in kinds:
             rng, found = np.random.default_rng(args.seed), []
-            for row in loop_rows:
+            for row in visited[name]:
                 if row["variant"] == label:
                     states = loops.replay(row)[:-1]
                     times = rng.choice(len(states), size=min(20, len(states)), replace=False)
@@ -155,7 +159,7 @@ def critic(args):
             with torch.no_grad():
                 goal = torch.tensor(cstr.EVAL_GOAL).expand(len(found), -1)
                 learned = value(torch.tensor(found[:, 2:]), goal).numpy()
-            simulated = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 500, rng)
+            simulated = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng)
             for (episode, t, *state), v, mc in zip(found, learned, simulated):
                 rows.append({"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}
                             | {column: round(s, 4) for column, s in zip(cstr.STATE_NAMES, state)}

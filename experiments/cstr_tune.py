@@ -21,7 +21,13 @@ import cstr_loops as loops
 
 from envs import cstr
 
-PRICES = ((0.01, 1.0), (0.03, 1.0), (0.1, 1.0), (1.0, 1.0), (10.0, 10.0))  # per mol/l and per degC, averaged over scenarios
+PRICES = (
+    (0.01, 1.0),
+    (0.03, 1.0),
+    (0.1, 1.0),
+    (1.0, 1.0),
+    (10.0, 10.0),
+)  # per mol/l and per degC, summed over scenarios as the published ones
 CHANGES = (1.0, 0.1)  # times the published weights
 
 
@@ -53,14 +59,18 @@ def settings(prices, change, horizon):
     )
 
 
+GRID = {"published": ()} | {
+    f"{prices[0]:g} per mol/l, {prices[1]:g} per degC, changes x {change:g}, N = {horizon}": settings(prices, change, horizon)
+    for prices, change, horizon in [(p, change, 20) for p in PRICES for change in CHANGES] + [(p, 0.1, 40) for p in PRICES[1:4]]
+}
+
+
 def main(args):
     cells.check(args, "cstr_tune.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     table = args.out / "results/cstr_tune.csv"
     if not args.plot_only:
-        grid = [(prices, change, 20) for prices in PRICES for change in CHANGES] + [(prices, 0.1, 40) for prices in PRICES[1:4]]
-        names = {f"{p[0]:g} per mol/l, {p[1]:g} per degC, changes x {change:g}, N = {n}": settings(p, change, n) for p, change, n in grid}
-        variants = {"published": ()} | (dict(list(names.items())[:1]) if args.quick else names)
-        variants = {label: dict(controllers=("robust_mpc",), benchmark=benchmark) for label, benchmark in variants.items()}
+        variants = {label: dict(controllers=("robust_mpc",), benchmark=benchmark) for label, benchmark in GRID.items()}
+        variants = dict(list(variants.items())[:2]) if args.quick else variants
         rows, found = loops.collect(variants, args), []
         for label in variants:
             near, outside = (loops.values(rows, label, k) for k in ("time_near_goal", "time_outside_constraints"))

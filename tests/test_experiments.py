@@ -216,6 +216,15 @@ def test_the_oracle_is_no_worse_than_any_controller():
         assert float(row["objective"]) == pytest.approx(float(row["time_near_goal"]) - weight * slack, abs=1e-4)
 
 
+def test_the_tuned_benchmark_is_the_best_of_its_table():
+    sys.path.insert(0, str(ROOT / "experiments"))
+    import cstr_deploy
+    import cstr_tune
+
+    best = max(csv.DictReader(open(ROOT / "experiments/results/cstr_tune.csv")), key=lambda row: float(row["score"]))
+    assert cstr_tune.GRID[best["variant"]] == cstr_deploy.TUNED
+
+
 def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
     sys.path.insert(0, str(ROOT / "experiments"))
     import cstr_oracle
