@@ -1,6 +1,6 @@
 # /// script
 # requires-python = ">=3.11"
-# dependencies = ["gymnasium==1.4.0", "casadi==3.8.2", "numpy", "tyro", "matplotlib", "tqdm"]
+# dependencies = ["gymnasium==1.4.0", "casadi==3.8.2", "numpy", "scipy", "tyro", "matplotlib", "tqdm"]
 # ///
 """Goal-conditioned scenario MPC written out in CasADi: scenario tree, soft constraints, Gaussian objective (eq:multiMPCobj).
 
