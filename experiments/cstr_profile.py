@@ -4,7 +4,7 @@
     python experiments/cstr_profile.py --goal 0.65 --start 0.8 0.3 60 60 --out runs/cold
     python experiments/cstr_profile.py --plot-only  # redraw from the committed CSV
 
-The actor is the paper's, blind to constraints; RL+MPC is the default of rl_mpc_deploy.py, with soft and with hard constraints.
+The paper's agent is blind to constraints; the constraint-aware one is the default of rl_mpc_deploy.py, with soft and with hard constraints.
 Writes results/cstr_profile.csv (a row per controller and sampling time) and figures/cstr_profile.png.
 """
 
@@ -22,13 +22,16 @@ import cells
 import rl_mpc_deploy as deploy
 from envs import cstr
 
-CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args)
-    "actor": ("actor", dict(critic=HERE / "pretrained/cstr_robust.pt")),
-    "robust_mpc": ("robust_mpc", {}),
-    "rl_mpc": ("rl_mpc", {}),
-    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard")),
+PAPER = dict(critic=HERE / "pretrained/cstr_robust.pt")
+CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, style)
+    "actor": ("actor", PAPER, "RL, paper's", ("#D55E00", "--")),
+    "robust_mpc": ("robust_mpc", {}, "robust MPC", ("#0072B2", "-.")),
+    "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", ("#56B4E9", "-")),
+    "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", ("#009E73", "-")),
+    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard"), "the same, hard constraints", ("black", (0, (1, 1.5)))),
 }
-deploy.LABELS["rl_mpc_hard"], deploy.STYLES["rl_mpc_hard"] = "RL+MPC, hard constraints", ("#56B4E9", (0, (5, 1, 1, 1)))
+for name, (_, _, label, style) in CONTROLLERS.items():
+    deploy.LABELS[name], deploy.STYLES[name] = label, style
 
 
 @dataclass
@@ -53,7 +56,7 @@ class Args:
 
 def profile(name, args):
     """Rows of one controller's closed loop; the last action is held for the last row."""
-    kind, options = CONTROLLERS[name]
+    kind, options, *_ = CONTROLLERS[name]
     settings = deploy.Args(goal=(args.goal,), **options)
     controller = deploy.build_controller(kind, settings)
     psi, steps = np.array([args.alpha, args.beta]), 5 if args.quick else args.steps
