@@ -201,7 +201,7 @@ def plot_agents(rows, path):
     ax.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     ax.grid(axis="y", alpha=0.3)
     starts = len({row["start"] for row in rows})
-    ax.legend(frameon=False, title=f"{seeds} training seeds x {starts} starts", loc="lower right")
+    ax.legend(frameon=False, title=f"{seeds} training seeds x {starts} starts", loc="upper left")
     fig.savefig(path, dpi=150)
 
 

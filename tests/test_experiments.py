@@ -49,7 +49,7 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_shift", None, [], []),
     ("cstr_shift", "critic", [], []),
     ("cstr_tune", None, ["cstr_tune"], []),
-    ("cstr_offline", None, [], []),
+    ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
     ("cstr_offline", "ablation", [], []),
 ]
 NO_RUNS = {"cstr_profile", "dip_equilibria", "solve_time"}  # too short to be kept in parts
