@@ -41,7 +41,7 @@ LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distanc
 REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_deploy", None, ["cstr_deploy"], ["cstr_deploy", "cstr_deploy_full"]),
     ("cstr_deploy", "critics", [], []),
-    ("cstr_deploy", "literal", [], []),
+    ("cstr_deploy", "literal", ["cstr_literal"], ["cstr_literal"]),
     ("cstr_deploy", "expansion", ["cstr_expansion"], ["cstr_expansion"]),
     ("cstr_oracle", None, ["cstr_oracle", "cstr_oracle_gap"], []),
     ("cstr_frontier", None, [], []),
