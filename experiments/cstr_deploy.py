@@ -1,6 +1,6 @@
 """Figures `cstr_rlmpc` and `full_cstr_rlmpc`: every controller of the reactor on paired draws of start state and plant.
 
-    python experiments/cstr_deploy.py --jobs 2                   # 200 draws, half an hour; continues where it stopped
+    python experiments/cstr_deploy.py --jobs 2                   # 200 draws, 50 minutes; continues where it stopped
     python experiments/cstr_deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
     python experiments/cstr_deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours
     python experiments/cstr_deploy.py --study expansion --jobs 2 # the learned value and its second-order expansions
@@ -98,6 +98,12 @@ def variants(args):
     for (kind, seed, _), path in zip(agents, paths):
         found |= {f"RL, {kind}, seed {seed}": ACTOR | dict(critic=path), f"RL+MPC, {kind}, seed {seed}": RL_MPC | dict(critic=path)}
     return found
+
+
+def summary(rows):
+    """[(median, 5th percentile)] of time near goal and of time outside constraints."""
+    found = [np.array([float(row[key]) for row in rows]) for key in MEASURES]
+    return [(float(np.median(v)), float(np.quantile(v, 0.05))) for v in found]
 
 
 def print_table(rows):

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
-import numpy as np
 import tyro
 
 matplotlib.use("Agg")
@@ -24,7 +23,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
 import cstr_loops as loops
-from cstr_deploy import AWARE, PAPER, RL_MPC
+from cstr_deploy import AWARE, PAPER, RL_MPC, summary
 
 WEIGHTS = (0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
 CURVES = {  # label: (colour, marker, keywords of cstr_loops)
@@ -64,12 +63,6 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def summary(rows):
-    """(near, outside) of rows: medians, 5th percentiles."""
-    found = [np.array([float(row[key]) for row in rows]) for key in ("time_near_goal", "time_outside_constraints")]
-    return [float(np.median(v)) for v in found], [float(np.quantile(v, 0.05)) for v in found]
-
-
 def plot(args):
     rows = cells.read(args.out / "results/cstr_frontier.csv")
     draws = {(row["seed"], row["episode"]) for row in rows}
@@ -83,10 +76,10 @@ def plot(args):
         points = [summary(group) for group in groups]
         for ax, k in zip(axes, (0, 1)):
             size = 9 if len(points) == 1 else 6
-            ax.plot([p[k][1] for p in points], [p[k][0] for p in points], marker=marker, color=colour, ls=ls, ms=size, lw=1.5, label=label)
+            ax.plot([p[1][k] for p in points], [p[0][k] for p in points], marker=marker, color=colour, ls=ls, ms=size, lw=1.5, label=label)
             for name, p in zip(names or [], points):
-                ax.annotate(name, (p[k][1], p[k][0]), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour)
-        for name, ((near, outside), (near_low, outside_low)) in zip(names or [""], points):
+                ax.annotate(name, (p[1][k], p[0][k]), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour)
+        for name, ((near, near_low), (outside, outside_low)) in zip(names or [""], points):
             text = f"{label}{', slack weight ' if name else ''}{name}"
             print(f"{text:46s}{near:14.1f}{near_low:9.1f}{outside:18.1f}{outside_low:9.1f}")
 

@@ -1,7 +1,7 @@
 """How far each controller of the reactor is from the best possible: one optimal control problem over the whole episode for each draw.
 
     python experiments/cstr_deploy.py --jobs 2      # first: the controllers, whose trajectories are guesses
-    python experiments/cstr_oracle.py --jobs 2      # half an hour; continues where it stopped
+    python experiments/cstr_oracle.py --jobs 2      # twenty minutes; continues where it stopped
     python experiments/cstr_oracle.py --plot-only   # print the tables from the committed CSV
 
 The oracle knows the plant's parameters and the whole episode, and maximises the evaluation's own time near goal minus a slack penalty of 1
@@ -31,6 +31,7 @@ sys.path.insert(0, str(HERE.parent))
 import cells
 import cstr_deploy
 import cstr_loops as loops
+from cstr_deploy import summary
 
 import envs
 import rl_mpc_deploy as deploy
@@ -181,17 +182,10 @@ def gaps(found, controllers):
     return [{k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
 
 
-def quantiles(rows, **wanted):
-    """(median, 5th percentile) of time near goal and of time outside constraints."""
-    mine = [row for row in rows if all(row[key] == value for key, value in wanted.items())]
-    found = [np.array([float(row[key]) for row in mine]) for key in ("time_near_goal", "time_outside_constraints")]
-    return [(float(np.median(v)), float(np.quantile(v, 0.05))) for v in found]
-
-
 def check_goal(found, controllers, variant):
     """The goal that the repository sets itself, line by line, for one controller."""
-    (near, near_low), (outside, outside_low) = quantiles(controllers, variant=variant)
-    (best, best_low), (kept, kept_low) = quantiles(found, weight="5.0")
+    (near, near_low), (outside, outside_low) = summary([row for row in controllers if row["variant"] == variant])
+    (best, best_low), (kept, kept_low) = summary([row for row in found if row["weight"] == "5.0"])
     lines = [
         ("near goal, median, of the oracle's (slack weight 5): 97 % wanted", 100 * near / best, 97.0),
         ("near goal, 5th percentile, of the oracle's: 90 % wanted", 100 * near_low / best_low, 90.0),
@@ -199,7 +193,7 @@ def check_goal(found, controllers, variant):
         ("outside, 5th percentile, less the oracle's: -5 at least", outside_low - kept_low, -5.0),
     ]
     for benchmark in ("robust MPC, N = 20", "robust MPC, tuned, N = 40"):
-        (other, other_low), (bounds, bounds_low) = quantiles(controllers, variant=benchmark)
+        (other, other_low), (bounds, bounds_low) = summary([row for row in controllers if row["variant"] == benchmark])
         lines += [
             (f"near goal, median, less that of {benchmark}", near - other, 0.0),
             ("the same, 5th percentile", near_low - other_low, 0.0),
