@@ -34,8 +34,8 @@ CURVES = {  # label: (colour, marker, keywords of cstr_loops)
 }
 POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
     "nominal MPC, N = 20": ("#999999", "P", "nominal MPC"),
-    "robust MPC, N = 20": ("black", "X", "robust MPC"),
-    "robust MPC, tuned, N = 40": ("black", "*", "robust MPC, tuned, N = 40"),
+    "robust MPC, N = 20": ("#999999", "X", "robust MPC"),
+    "robust MPC, tuned, N = 40": ("#999999", "*", "robust MPC, tuned, N = 40"),
     "goal-conditioned MPC, N = 5": ("#E69F00", "P", "goal-conditioned MPC, N = 5"),
     "RL, constraint-aware": ("#D55E00", "^", "RL, constraint-aware"),
     "RL+MPC, constraint-aware, N = 0": ("#009E73", "P", "RL+MPC, N = 0"),
@@ -69,6 +69,9 @@ def plot(args):
     fig, axes = plt.subplots(1, 2, figsize=(10, 5.2), layout="constrained")
     for ax, title in zip(axes, ("medians", "5th percentiles")):
         ax.set(xlabel="time outside constraints [steps], 0 is best", ylabel="time near goal [steps]", title=title)
+        ax.set_xscale("symlog", linthresh=1)
+        ax.set_xlim(-120, 0.3 if title == "medians" else -5)
+        ax.set_xticks([-100, -30, -10, -3, -1, 0], ["-100", "-30", "-10", "-3", "-1", "0"])
         ax.grid(alpha=0.3)
     print(f"{len(draws)} draws{'':36s}near goal: median  5 %-ile   outside: median  5 %-ile")
 
@@ -78,6 +81,8 @@ def plot(args):
             size = 9 if len(points) == 1 else 6
             ax.plot([p[1][k] for p in points], [p[0][k] for p in points], marker=marker, color=colour, ls=ls, ms=size, lw=1.5, label=label)
             for name, p in zip(names or [], points):
+                if name not in (names[0], "2", names[-1]):
+                    continue
                 ax.annotate(name, (p[1][k], p[0][k]), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour)
         for name, ((near, near_low), (outside, outside_low)) in zip(names or [""], points):
             text = f"{label}{', slack weight ' if name else ''}{name}"
@@ -88,7 +93,7 @@ def plot(args):
     for row in oracle:
         by_weight.setdefault(row["weight"], []).append(row)
     by_weight = {weight: group for weight, group in by_weight.items() if len(group) == len(draws)}
-    draw(by_weight.values(), "oracle", "#F0E442", "h", [f"{float(weight):g}" for weight in by_weight])
+    draw(by_weight.values(), "oracle", "black", "h", [f"{float(weight):g}" for weight in by_weight])
     for label, (colour, marker, _) in CURVES.items():
         groups = {}
         for row in rows:

@@ -117,7 +117,8 @@ def plot_plants(rows, path):
 
 
 def simulated_value(critic_path, x, rollouts, steps, rng):
-    """What V(x) = Q(x, mu(x)) estimates, by simulation from x (B, n_x): the mean first action, then SAC's soft return of its policy.
+    """What V(x) = Q(x, mu(x)) estimates, by simulation from x (B, n_x): the mean first action, then SAC's soft return of its policy; and
+    that policy's time outside constraints over the first 100 steps. Both (B,).
 
     Parameters are redrawn at every step, as in training.
     """
@@ -127,7 +128,7 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
     generator = torch.Generator().manual_seed(0)
     x = np.repeat(x, rollouts, axis=0)
     goal = torch.tensor(cstr.EVAL_GOAL, dtype=torch.float32).expand(len(x), -1)
-    total, weight = np.zeros(len(x)), 1.0
+    total, outside, weight = np.zeros(len(x)), np.zeros(len(x)), 1.0
     for t in range(steps):
         with torch.no_grad():
             z = scaling.features(torch.tensor(x, dtype=torch.float32), goal, data["goal_input"])
@@ -136,9 +137,11 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
         entropy = -data["alpha"] * log_prob.numpy() if a["entropy_in_target"] else 0.0
         x = cstr.step(x, u, rng.choice(cstr.SCENARIOS["robust"], size=len(x)), substeps=4)
         reward = envs.goal_reward(cstr, x[:, cstr.GOAL_INDEX], cstr.EVAL_GOAL)
-        total += weight * (entropy + reward + a["constraint_weight"] * envs.outside_constraints(cstr, x))
+        violation = envs.outside_constraints(cstr, x)
+        total += weight * (entropy + reward + a["constraint_weight"] * violation)
+        outside += violation if t < 100 else 0.0
         weight *= data["gamma"]
-    return total.reshape(-1, rollouts).mean(1)
+    return total.reshape(-1, rollouts).mean(1), outside.reshape(-1, rollouts).mean(1)
 
 
 def critic(args):
@@ -159,33 +162,35 @@ def critic(args):
             with torch.no_grad():
                 goal = torch.tensor(cstr.EVAL_GOAL).expand(len(found), -1)
                 learned = value(torch.tensor(found[:, 2:]), goal).numpy()
-            simulated = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng)
-            for (episode, t, *state), v, mc in zip(found, learned, simulated):
+            simulated, outside = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng)
+            for (episode, t, *state), v, mc, out in zip(found, learned, simulated, outside):
                 rows.append({"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}
                             | {column: round(s, 4) for column, s in zip(cstr.STATE_NAMES, state)}
-                            | {"learned": round(float(v), 4), "simulated": round(float(mc), 4)})  # fmt: skip
+                            | {"learned": round(float(v), 4), "simulated": round(float(mc), 4), "outside": round(float(out), 4)})  # fmt: skip
     return rows
 
 
 def plot_critic(rows, path):
-    fig, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
-    print("critic            visited by        states  rank correlation  mean error  mean |error|  the same below 80 degC")
-    for ax, name in zip(axes, CRITICS):
+    fig, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained")
+    print(
+        "critic            visited by        states  mean error  mean |error|  rank correlation of the value with its return and with time outside"
+    )
+    for (ax, lower), name in zip(axes.T, CRITICS):
         for label, colour, marker in (("actor", "#D55E00", "o"), ("RL+MPC, N = 5", "#009E73", "^")):
             mine = [row for row in rows if (row["critic"], row["visited_by"]) == (name, label)]
-            learned, simulated, t_r = (np.array([float(row[key]) for row in mine]) for key in ("learned", "simulated", "T_R"))
-            error, cold = learned - simulated, t_r < 80
-            correlation = spearmanr(learned, simulated).statistic
-            ax.plot(
-                simulated, learned, marker, color=colour, ms=3, alpha=0.5, label=f"visited by {label}: rank correlation {correlation:.2f}"
-            )
-            cold_text = f"{error[cold].mean():9.1f}{np.abs(error[cold]).mean():9.1f} ({cold.sum()} states)" if cold.any() else ""
-            print(f"{name:18s}{label:18s}{len(mine):6d}{correlation:18.2f}{error.mean():12.1f}{np.abs(error).mean():14.1f}  {cold_text}")
+            learned, simulated, outside = (np.array([float(row[key]) for row in mine]) for key in ("learned", "simulated", "outside"))
+            error, found = learned - simulated, [spearmanr(learned, v).statistic for v in (simulated, outside)]
+            for axis, v, correlation in zip((ax, lower), (simulated, outside), found):
+                text = f"visited by {label}: rank correlation {correlation:.2f}"
+                axis.plot(v, learned, marker, color=colour, ms=3, alpha=0.5, label=text)
+            print(f"{name:18s}{label:18s}{len(mine):6d}{error.mean():12.1f}{np.abs(error).mean():14.1f}{found[0]:40.2f}{found[1]:23.2f}")
         ends = [min(ax.get_xlim()[0], ax.get_ylim()[0]), max(ax.get_xlim()[1], ax.get_ylim()[1])]
         ax.plot(ends, ends, color="black", lw=1)
         ax.set(xlabel="simulated return", ylabel="learned value", title=f"{name} critic")
-        ax.grid(alpha=0.3)
-        ax.legend(frameon=False, fontsize=8, loc="upper left")
+        lower.set(xlabel="the policy's time outside constraints from here [steps]", ylabel="learned value")
+        for axis in (ax, lower):
+            axis.grid(alpha=0.3)
+            axis.legend(frameon=False, fontsize=8, loc="lower right" if axis is ax else "lower left")
     fig.savefig(path, dpi=150)
 
 
