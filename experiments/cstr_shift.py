@@ -166,31 +166,31 @@ def critic(args):
             for (episode, t, *state), v, mc, out in zip(found, learned, simulated, outside):
                 rows.append({"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}
                             | {column: round(s, 4) for column, s in zip(cstr.STATE_NAMES, state)}
-                            | {"learned": round(float(v), 4), "simulated": round(float(mc), 4), "outside": round(float(out), 4)})  # fmt: skip
+                            | {"learned": round(float(v), 4), "simulated": round(float(mc), 4),
+                               "outside": round(float(out), 4)})  # fmt: skip
     return rows
 
 
 def plot_critic(rows, path):
     fig, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained")
-    print(
-        "critic            visited by        states  mean error  mean |error|  rank correlation of the value with its return and with time outside"
-    )
+    print(f"{'':42s}{'error of the value':>26s}   its rank correlation with return and time outside")
     for (ax, lower), name in zip(axes.T, CRITICS):
         for label, colour, marker in (("actor", "#D55E00", "o"), ("RL+MPC, N = 5", "#009E73", "^")):
             mine = [row for row in rows if (row["critic"], row["visited_by"]) == (name, label)]
             learned, simulated, outside = (np.array([float(row[key]) for row in mine]) for key in ("learned", "simulated", "outside"))
             error, found = learned - simulated, [spearmanr(learned, v).statistic for v in (simulated, outside)]
             for axis, v, correlation in zip((ax, lower), (simulated, outside), found):
-                text = f"visited by {label}: rank correlation {correlation:.2f}"
+                text = f"{label}: rank correlation {correlation:.2f}"
                 axis.plot(v, learned, marker, color=colour, ms=3, alpha=0.5, label=text)
-            print(f"{name:18s}{label:18s}{len(mine):6d}{error.mean():12.1f}{np.abs(error).mean():14.1f}{found[0]:40.2f}{found[1]:23.2f}")
+            errors = f"{error.mean():.1f}, absolute {np.abs(error).mean():.1f}"
+            print(f"{f'{name}, visited by {label}, {len(mine)} states':46s}{errors:>22s}{found[0]:31.2f}{found[1]:18.2f}")
         ends = [min(ax.get_xlim()[0], ax.get_ylim()[0]), max(ax.get_xlim()[1], ax.get_ylim()[1])]
         ax.plot(ends, ends, color="black", lw=1)
         ax.set(xlabel="simulated return", ylabel="learned value", title=f"{name} critic")
         lower.set(xlabel="the policy's time outside constraints from here [steps]", ylabel="learned value")
         for axis in (ax, lower):
             axis.grid(alpha=0.3)
-            axis.legend(frameon=False, fontsize=8, loc="lower right" if axis is ax else "lower left")
+            axis.legend(frameon=False, fontsize=8, title="visited by", title_fontsize=8)
     fig.savefig(path, dpi=150)
 
 

@@ -40,14 +40,14 @@ LINEAR_STUDIES = [("linear_scalability", "main"), ("linear_scalability", "sweep"
 LINEAR_STUDIES += [("linear_value_mpc", study) for study in ("profile", "distance", "scaling")]
 REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_deploy", None, ["cstr_deploy"], ["cstr_deploy", "cstr_deploy_full"]),
-    ("cstr_deploy", "critics", [], []),
+    ("cstr_deploy", "critics", ["cstr_critics"], ["cstr_critics"]),
     ("cstr_deploy", "literal", ["cstr_literal"], ["cstr_literal"]),
     ("cstr_deploy", "expansion", ["cstr_expansion"], ["cstr_expansion"]),
     ("cstr_oracle", None, ["cstr_oracle", "cstr_oracle_gap"], []),
-    ("cstr_frontier", None, [], []),
+    ("cstr_frontier", None, ["cstr_frontier"], ["cstr_frontier"]),
     ("cstr_ablation", None, [], []),
     ("cstr_shift", None, [], []),
-    ("cstr_shift", "critic", [], []),
+    ("cstr_shift", "critic", ["cstr_shift_critic"], ["cstr_shift_critic"]),
     ("cstr_tune", None, ["cstr_tune"], []),
     ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
     ("cstr_offline", "ablation", [], []),
