@@ -46,7 +46,7 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_oracle", None, ["cstr_oracle", "cstr_oracle_gap"], []),
     ("cstr_frontier", None, ["cstr_frontier"], ["cstr_frontier"]),
     ("cstr_ablation", None, [], []),
-    ("cstr_shift", None, [], []),
+    ("cstr_shift", None, ["cstr_shift"], ["cstr_shift"]),
     ("cstr_shift", "critic", ["cstr_shift_critic"], ["cstr_shift_critic"]),
     ("cstr_tune", None, ["cstr_tune"], []),
     ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
