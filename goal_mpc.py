@@ -6,7 +6,8 @@
 
     minimise over u   1/S sum_i { sum_{t=1}^{N} [ l(x_t^i, g_t) + w'|eps_t^i| + w2'(eps_t^i)^2 + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
     subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi_t^i),   x_0^i = s,   x_t^i - eps_t^i in X,   u_t^i in U,   u_t^i = u_t^j while i and j
-                      share their history; over the robust horizon the paths i take every sequence of scenarios, then each keeps its last
+                      share their history; over the robust horizon the paths i take every sequence of scenarios, then each keeps its last;
+                      with a discount what stands at stage t counts gamma^t
 
 with the stage cost l chosen by `--objective` (the paper's Example 1) from the plant's goal error e, for the pendulum 1 - cos(theta - g):
 goal -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy. A linear plant has
@@ -100,10 +101,10 @@ class Args:
     """fatrop: faster on long horizons, fails more often; nominal problems (--robust-horizon 0) only"""
     guide_horizon: int = 0
     """horizon of a controller whose simulated closed loop is the first guess; 0: the start state held (linear: the regulator's
-    closed loop). Helps from N = 100 on"""
+    closed loop). The pendulum gains from N = 100 on"""
     compile: bool = True
-    """translate the optimal control problem to C and compile it once (kept in ~/.cache/rlmpc); linear plants are never compiled, since
-    matrix products gain nothing"""
+    """translate the optimal control problem to C and compile it once (kept in $XDG_CACHE_HOME/rlmpc, or ~/.cache/rlmpc); linear plants
+    are never compiled, since matrix products gain nothing"""
     animate: bool = False
     """write episode.gif of the first episode, with the predicted motion drawn faintly"""
     out: Path | None = None
@@ -153,7 +154,7 @@ class ScenarioMPC:
     gamma: what stands at stage t, slack included, counts gamma^t.
     scenarios: (S, n_psi); the first is the nominal one. robust_horizon: stages at which the tree branches, 0 = nominal.
     slack_price, slack_price_l2: (2, n_x) or scalars, of a violation of X_LOW (first row) and X_HIGH and of its square, per physical
-    unit; an infinite slack_price makes a bound hard, 0 ignores it.
+    unit; an infinite slack_price makes a bound hard, 0 for both ignores it.
     change_weight: (n_u,), price of the squared change of each action.
     solver: "ipopt", or "fatrop" for robust_horizon = 0.
     law, control_horizon: CasADi function (x, goal) -> u that the actions follow from that stage on, or None.
@@ -165,6 +166,8 @@ class ScenarioMPC:
                  guide=None, tol=1e-6, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
+        if control_horizon is not None and control_horizon < horizon and law is None:
+            raise ValueError(f"control_horizon is {control_horizon}, but there is no law that the actions follow from there on")
         if solver == "fatrop" and robust_horizon:
             raise ValueError("solver fatrop needs robust_horizon 0: its stages must have one node each")
         self.plant, self.horizon, self.robust_horizon, self.discretization = plant, horizon, robust_horizon, discretization
@@ -175,7 +178,7 @@ class ScenarioMPC:
         self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
         bounds = np.array([plant.X_LOW, plant.X_HIGH])
         self.slack_price = np.where(np.isinf(bounds), 0.0, np.broadcast_to(slack_price, bounds.shape))
-        self.slack_price_l2 = np.broadcast_to(slack_price_l2, bounds.shape)
+        self.slack_price_l2 = np.where(np.isinf(bounds), 0.0, np.broadcast_to(slack_price_l2, bounds.shape))
         self.hard_bounds = np.where(np.isinf(self.slack_price), bounds, [[-np.inf], [np.inf]])
         self.change_weight = np.zeros(self.n_u) if change_weight is None else np.asarray(change_weight, dtype=float)
         self.solver, self.guide, self.gamma = solver, guide, gamma
@@ -201,7 +204,8 @@ class ScenarioMPC:
 
     def _build_layout(self):
         """Where each block (name, stage) lies in w or g: stage after stage, as fatrop needs it and IPOPT does not mind."""
-        self.soft = [np.flatnonzero((price > 0) & np.isfinite(price)) for price in self.slack_price]  # states with slack below, above
+        priced = np.isfinite(self.slack_price) & (self.slack_price + self.slack_price_l2 > 0)
+        self.soft = [np.flatnonzero(p) for p in priced]  # states with slack below, above
         self.index, self.size, slacks = {}, {"w": 0, "g": 0}, sum(map(len, self.soft))
 
         def block(vector, name, t, rows, nodes):
@@ -537,18 +541,21 @@ def feedback_law(plant, gamma=1.0):
     return ca.Function("law", [x, goal], [plant.feedback(x, goal, gamma)])
 
 
+def scenario_set(plant, name):
+    """Parameters (S, n_psi) of the plant's scenario set, the nominal ones first, whether the set has them or not."""
+    scenarios = plant.SCENARIOS[name]
+    return np.concatenate([plant.PSI_NOMINAL[None], scenarios[(scenarios != plant.PSI_NOMINAL).any(axis=1)]])
+
+
 def build_controller(args):
     """The controller that the arguments describe, for the plant's evaluation goal."""
     plant = envs.load(args.env, dim=args.dim, system=args.system)
     guide = build_controller(replace(args, horizon=args.guide_horizon, guide_horizon=0)) if args.guide_horizon else None
     change_weight = plant.EXPERT_CHANGE_WEIGHT if args.change_weight is None and args.objective == "expert" else args.change_weight
-    scenarios = plant.SCENARIOS[args.scenarios]
-    nominal = (scenarios == plant.PSI_NOMINAL).all(axis=1)
-    scenarios = np.concatenate([plant.PSI_NOMINAL[None], scenarios[~nominal]])
     law = feedback_law(plant, args.gamma) if args.control_horizon is not None else None
-    return ScenarioMPC(plant, args.horizon, scenarios, *costs(plant, args.objective, args.sigma2, args.gamma), law=law,
-                       goal=plant.EVAL_GOAL, gamma=args.gamma, control_horizon=args.control_horizon,
-                       robust_horizon=args.robust_horizon, discretization=args.discretization,
+    return ScenarioMPC(plant, args.horizon, scenario_set(plant, args.scenarios),
+                       *costs(plant, args.objective, args.sigma2, args.gamma), goal=plant.EVAL_GOAL, gamma=args.gamma, law=law,
+                       control_horizon=args.control_horizon, robust_horizon=args.robust_horizon, discretization=args.discretization,
                        slack_price=np.inf if args.constraints == "hard" else args.slack_weight, slack_price_l2=args.slack_weight_l2,
                        change_weight=change_weight, solver=args.solver, guide=guide,
                        compile=args.compile and not hasattr(plant, "next_state"))  # fmt: skip
@@ -678,7 +685,7 @@ def fail(message):
 def check(args):
     """Refuse arguments that cannot work, before anything long starts; returns plant and goals (steps, n_goal)."""
     ranges = {"horizon": (1, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "seed": (0, 10**9),
-              "guide_horizon": (0, 1000), "gamma": (1e-3, 1), "sigma2": (1e-9, 1e9), "slack_weight": (1e-6, 1e6),
+              "guide_horizon": (0, 1000), "gamma": (1e-3, 1), "sigma2": (1e-9, 1e9), "slack_weight": (0, 1e6),
               "slack_weight_l2": (0, 1e6)}  # fmt: skip
     for name, (least, most) in ranges.items():
         value = getattr(args, name)
@@ -698,7 +705,7 @@ def check(args):
         fail(f"--discretization radau needs a differential equation; {args.env} is a discrete-time plant")
     if args.scenarios not in plant.SCENARIOS:
         fail(f"--scenarios {args.scenarios} is not a scenario set of {args.env}; choose one of {', '.join(plant.SCENARIOS)}")
-    leaves = len(plant.SCENARIOS[args.scenarios]) ** min(args.robust_horizon, args.horizon)
+    leaves = len(scenario_set(plant, args.scenarios)) ** min(args.robust_horizon, args.horizon)
     if leaves * args.horizon > 20_000:
         fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; leaves times --horizon may be 20000 at most")
     if not args.guide_horizon < args.horizon:
@@ -712,6 +719,13 @@ def check(args):
     weights = args.change_weight
     if weights is not None and not (len(weights) == len(plant.U_LOW) and all(0 <= weight < np.inf for weight in weights)):
         fail(f"--change-weight is {weights}; it needs {len(plant.U_LOW)} number(s), each at least 0")
+    without = [("sigma2", args.objective != "goal", f"--objective {args.objective}"),
+               ("slack_weight", args.constraints == "hard", "--constraints hard"),
+               ("slack_weight_l2", args.constraints == "hard", "--constraints hard"),
+               ("scenarios", not args.robust_horizon, "--robust-horizon 0")]  # fmt: skip
+    for name, unused, setting in without:
+        if unused and getattr(args, name) != getattr(Args, name):
+            fail(f"--{name.replace('_', '-')} {getattr(args, name)} has no effect with {setting}")
     if args.animate and not hasattr(plant, "animate"):
         fail(f"--animate needs a plant that can be drawn; {args.env} defines no animation")
     return plant, goals
@@ -729,13 +743,13 @@ def main(args):
     mpc = build_controller(args)
     print(f"{plant.ENV_ID}: {mpc.size['w']} variables, {mpc.size['g']} constraints, built in {time.perf_counter() - tick:.1f} s")
     rows, episodes = [], []
+    settings = {name: getattr(args, name) for name in ("env", "objective", "horizon", "robust_horizon", "constraints", "solver", "gamma")}
+    settings |= {"sigma2": args.sigma2 or "", "goal": " ".join(args.goal)}  # empty: the plant's
     with tqdm(total=args.episodes * args.steps, unit="step", disable=None) as bar:
         for seed in range(args.seed, args.seed + args.episodes):
             x0, psi = start_and_plant(plant, seed, args.plant == "random")
             x, u, predicted, log = simulate(mpc, x0, psi, goals, args.preview, bar)
-            rows.append(
-                {"env": args.env, "objective": args.objective, "horizon": args.horizon, "seed": seed} | summary(plant, x, u, goals, log)
-            )
+            rows.append(settings | {"seed": seed} | summary(plant, x, u, goals, log))
             episodes.append((x, u, predicted))
     write_csv(rows, out / "results.csv")
     np.savez_compressed(out / "trajectories.npz", goals=goals, **{k: np.stack([e[i] for e in episodes]) for i, k in enumerate("xu")})

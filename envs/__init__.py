@@ -14,12 +14,13 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     SCENARIOS                                     sets to draw psi from: "nominal", "mpc" (its first is nominal), "robust" (training)
     BENCHMARK                                     horizon and prices of the MPC that rl_mpc_deploy.py compares with
     GOAL_INDEX                                    which states the goal is about, so `x[..., GOAL_INDEX]` is the achieved goal
-    TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE
+    TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE (box of the goals that can be held at steady state)
     ERROR_SCALE                                   size of a large goal error, (n_goal,): normalises the networks' input
     REWARD_SIGMA2, REWARD_TOLERANCE, MPC_SIGMA2   width of the Gaussian reward, half-width of the sparse one, width in goal_mpc.py
     ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
     MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
     TRAINING                                      arguments of sac_her_branching.py whose defaults it changes, {} for none
+optional: held_action(goal), the action (n_u,) that holds a goal, infinite if none does, where a box cannot tell
 optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), animate(...)
 
 A family of plants (`envs/linear.py`) defines `make(dim, system)` instead, which returns an object with these names. A plant in discrete

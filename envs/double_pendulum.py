@@ -54,7 +54,7 @@ GOALS = {"up-up": (0.0, 0.0), "up-down": (0.0, np.pi), "down-up": (np.pi, 0.0)} 
 TRAIN_GOALS = np.array(list(GOALS.values()))
 EVAL_GOAL = np.array(GOALS["up-up"])
 GOAL_LOW, GOAL_HIGH = -np.pi * np.ones(2), np.pi * np.ones(2)
-GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)
+GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)  # of these the ones that `held_action` can hold
 ERROR_SCALE = np.ones(2)  # not used: both goals are angles
 REWARD_SIGMA2 = 0.01  # of 1 - cos(error), eq:smoothreward in the paper's "time near goal"
 REWARD_TOLERANCE = 0.02  # 1 - cos of 0.2 rad
@@ -124,6 +124,11 @@ def potential_energy(x, psi=PSI_NOMINAL, xp=np):
 def expert_cost(x, xp=np):
     """Stage and terminal cost of the paper's expert agent, J: kinetic minus potential energy, which has no goal as its argument."""
     return kinetic_energy(x, xp=xp) - potential_energy(x, xp=xp)
+
+
+def held_action(goal):
+    """The force (1,) that holds both angles still: none, if each rod stands or hangs; else there is no such force (infinite)."""
+    return np.zeros(1) if np.allclose(np.sin(goal), 0, atol=1e-6) else np.full(1, np.inf)
 
 
 def goal_error(achieved, goal, xp=np):

@@ -143,7 +143,7 @@ def test_objective_is_that_of_a_naive_loop(robust_horizon, solver):
     stage = ca.Function("s", [x, g], [ca.sumsqr(x / span) + ca.sin(g) * x[1]])
     terminal = ca.Function("t", [x, g], [ca.sum1((x / span) ** 3) + g**2 * x[0]])
     price, price_l2, change = rng.uniform(1, 2, (2, 4)), rng.uniform(1, 2, (2, 4)), rng.uniform(0, 1e-3, 2)
-    price[0, 2] = 0.0  # no lower bound for T_R
+    price[0, 2] = price_l2[0, 2] = 0.0  # no lower bound for T_R
     mpc = gm.ScenarioMPC(cstr, N, cstr.SCENARIOS["mpc"][[0, 5]], stage, terminal, goal=[0.65], robust_horizon=robust_horizon, solver=solver,
                          slack_price=price, slack_price_l2=price_l2, change_weight=change, compile=False)  # fmt: skip
     w, goal, before = rng.uniform(-0.5, 0.5, mpc.size["w"]), rng.uniform(-1, 1, (1, N)), rng.uniform(cstr.U_LOW, cstr.U_HIGH)
@@ -211,6 +211,29 @@ def test_soft_equals_hard_where_hard_is_feasible(solver):
         results[price] = objective, np.abs(np.hstack(mpc.prediction()["x"])).max()
     assert results[np.inf][0] == pytest.approx(results[100.0][0], rel=1e-4) and results[100.0][1] < 0.5 + 1e-4
     assert results[0.0][1] > 0.51 and results[0.0][0] < results[np.inf][0]  # the bound was in the way
+
+
+def test_a_quadratic_price_alone_bends_a_plan_and_no_price_ignores_the_bound():
+    hot, deviations = np.array([0.8, 0.6, 139.0, 139.0]), []
+    x, g = ca.SX.sym("x", 4), ca.SX.sym("g", 1)
+    heat = ca.Function("heat", [x, g], [-x[2]])
+    for l2 in (0.0, 1e3):
+        mpc = gm.ScenarioMPC(cstr, 3, cstr.SCENARIOS["mpc"], heat, goal=[0.65], slack_price=0.0, slack_price_l2=l2, compile=False)
+        first_solve(mpc, hot)
+        deviations.append(max(states[2].max() for states in mpc.prediction()["x"]) - 140)
+    assert deviations[0] > 0.1 and deviations[1] < 0.5 * deviations[0]
+
+
+def test_a_control_horizon_needs_a_law():
+    with pytest.raises(ValueError, match="control_horizon is 2"):
+        pendulum(control_horizon=2)
+
+
+def test_the_pendulum_holds_still_where_its_rods_stand_or_hang():
+    assert (
+        gm.envs.can_hold(dp, np.array([[0.0, 0.0], [np.pi, 0.0], [0.0, -np.pi], [0.3, 0.0], [np.pi, 1.0]])).tolist()
+        == [True] * 3 + [False] * 2
+    )
 
 
 def test_slack_is_priced_per_physical_unit_and_squared():
@@ -391,7 +414,8 @@ def test_swing_up():
 
 
 COLUMNS = (
-    "env objective horizon seed time_near_goal action_total_variation solve_ms_median solve_ms_p95 solve_ms_max solver_failures".split()
+    "env objective horizon robust_horizon constraints solver gamma sigma2 goal seed time_near_goal action_total_variation solve_ms_median "
+    "solve_ms_p95 solve_ms_max solver_failures".split()
 )
 
 
@@ -413,7 +437,7 @@ def test_command_line_end_to_end(extra, files, tmp_path):
     assert {path.name for path in (tmp_path / "o").iterdir()} == files
     rows = list(csv.DictReader(open(tmp_path / "o" / "results.csv")))
     assert list(rows[0]) == COLUMNS and [row["seed"] for row in rows] == ["0", "1"][: len(rows)]
-    assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[2:])
+    assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[9:])
     assert all(word in out.stdout for word in ("near goal", "action TV", "ms median", "p95", "max", "failed"))
     again = run_script("--horizon", 6, "--steps", 4, "--no-compile", "--out", tmp_path / "p", *extra)
     assert again.returncode == 0
@@ -444,6 +468,9 @@ def test_command_line_end_to_end(extra, files, tmp_path):
         (["--animate", "--env", "cstr"], ["--animate", "cstr"]),
         (["--out", "LICENSE/folder"], ["--out", "cannot write"]),
         (["--robust-horizon", "5"], ["--robust-horizon", "5", "leaves"]),
+        (["--objective", "quadratic", "--sigma2", "2"], ["--sigma2", "no effect", "quadratic"]),
+        (["--constraints", "hard", "--slack-weight", "3"], ["--slack-weight", "no effect", "hard"]),
+        (["--scenarios", "extremes"], ["--scenarios", "no effect", "--robust-horizon 0"]),
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(arguments, words):
