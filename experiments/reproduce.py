@@ -1,0 +1,234 @@
+"""Every CSV and figure of the repository, from nothing: trains the critics, then runs every experiment.
+
+    python experiments/reproduce.py --list                         # what there is, and what is done
+    python experiments/reproduce.py --quick --out /tmp/quick       # all of it on tiny budgets, in a few minutes
+    python experiments/reproduce.py                                # all of it: most of a day on two cores; continues where it stopped
+    python experiments/reproduce.py --only cstr_deploy             # one step, after what it needs
+    python experiments/reproduce.py --backend dask --scheduler tcp://HOST:8786    # on a cluster whose workers share this folder
+
+A step is one command. Steps that do not need each other run side by side (joblib), those that measure times one by one at the end. A
+finished step leaves a note under --runs and is not repeated until a script changes; what an interrupted step had finished is kept
+as well, by the experiment itself. A command that a lost worker leaves behind does no harm: results appear by an atomic rename.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import joblib
+import tyro
+from tqdm import tqdm
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path.insert(0, str(HERE))
+import cells
+
+
+@dataclass(frozen=True)
+class Step:
+    name: str
+    command: tuple
+    """script, from the root of the repository, and its arguments"""
+    minutes: float
+    """about how long it takes with one process, for the time left"""
+    needs: tuple = ()
+    """names of steps whose results it reads"""
+    alone: bool = False
+    """it measures times: nothing else may run"""
+
+
+def experiment(script, study=None, minutes=1.0, needs=(), alone=False):
+    name = f"{script}_{study}" if study else script
+    return Step(name, (f"experiments/{script}.py", *(("--study", study) if study else ())), minutes, tuple(needs), alone)
+
+
+def training(name, *arguments, minutes=1.0):
+    return Step(f"critic_{name}", ("sac_her_branching.py", *arguments), minutes)
+
+
+CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained")
+STEPS = [
+    training("cstr_robust", "--env", "cstr"),
+    training("cstr_nominal", "--env", "cstr", "--scenarios", "nominal"),
+    training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
+    training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
+    experiment("dip_equilibria", minutes=2),
+    experiment("linear_scalability", "main", 15),
+    experiment("linear_scalability", "sweep", 30, ["linear_scalability_main"]),
+    experiment("linear_value_mpc", "train", 70),
+    experiment("linear_value_mpc", "distance", 20, ["linear_value_mpc_train"]),
+    experiment("cstr_training", minutes=25),
+    experiment("cstr_offline", minutes=15),
+    experiment("cstr_offline", "ablation", 40),
+    experiment("cstr_tune", minutes=40, needs=CRITICS),
+    experiment("cstr_profile", minutes=1, needs=CRITICS),
+    experiment("cstr_deploy", minutes=95, needs=CRITICS),
+    experiment("cstr_deploy", "critics", 15, CRITICS),
+    experiment("cstr_deploy", "literal", 20, CRITICS),
+    experiment("cstr_deploy", "expansion", 10, CRITICS),
+    experiment("cstr_oracle", minutes=40, needs=["cstr_deploy"]),
+    experiment("cstr_frontier", minutes=30, needs=["cstr_oracle"]),
+    experiment("cstr_ablation", minutes=100, needs=["cstr_deploy_critics"]),
+    experiment("cstr_shift", "plants", 50, CRITICS),
+    experiment("cstr_shift", "critic", 4, CRITICS),
+    experiment("dip_performance", minutes=90, alone=True),
+    experiment("linear_value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
+    experiment("linear_value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
+    experiment("solve_time", minutes=10, needs=CRITICS, alone=True),
+    experiment("training_speed", "profile", 1, alone=True),
+    experiment("training_speed", "ablation", 40, ["training_speed_profile"], alone=True),
+    experiment("training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
+    experiment("benchmark_peers", minutes=8, needs=CRITICS, alone=True),
+]
+ONE_AT_A_TIME = {"dip_equilibria", "cstr_profile", "solve_time", "benchmark_peers"}  # take no --jobs
+NOTHING_KEPT = {"dip_equilibria", "cstr_profile", "solve_time"}  # take no --runs
+
+
+@dataclass
+class Args:
+    quick: bool = False
+    """tiny budgets: a smoke test of everything; name an --out of its own, or it replaces the committed results"""
+    only: tuple[str, ...] = ()
+    """steps to run, with what they need; default: all"""
+    list: bool = False
+    """print the steps, what they need and whether they are done"""
+    jobs: int = 2
+    """steps at a time"""
+    backend: Literal["processes", "dask"] = "processes"
+    """where steps run: processes of this machine, or the workers of a dask cluster"""
+    scheduler: str = ""
+    """address of the dask scheduler"""
+    runs: Path = ROOT / "runs/reproduce"
+    """where finished parts are kept; on a cluster a folder that every worker sees"""
+    out: Path = HERE
+    """folder whose results/, figures/ and pretrained/ are written; experiments read the shipped critics, so that only the default trains
+    those that it then uses"""
+
+
+def version(quick):
+    """Of all code that a step may run, and of the budget."""
+    code = sorted(
+        path for folder in (".", "envs", "experiments") for path in (ROOT / folder).glob("*.py") if path.name != Path(__file__).name
+    )
+    return hashlib.sha256(b"".join(path.read_bytes() for path in code) + bytes([quick])).hexdigest()[:12]
+
+
+def note(step, args):
+    return args.runs / f"done/{step.name}_{version(args.quick)}.json"
+
+
+def run(step, args):
+    """One step, in a process of its own. Returns its name and what went wrong, or None."""
+    if note(step, args).exists():
+        return step.name, None
+    tick, script = time.time(), Path(step.command[0]).stem
+    command = [sys.executable, *step.command]
+    if step.name.startswith("critic_"):
+        trained = args.runs / f"critics/{step.name}_{os.getpid()}"
+        command += ["--out", str(trained), *(["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else [])]
+    else:
+        command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
+        command += [] if script in ONE_AT_A_TIME else ["--jobs", "1"]
+        shared = "cstr_loops" if script.startswith("cstr_") and script not in ("cstr_offline", "cstr_training") else script
+        command += [] if script in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    if result.returncode:
+        return step.name, f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
+    if step.name.startswith("critic_"):
+        target = args.out / f"pretrained/{step.name.removeprefix('critic_')}.pt"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        next(trained.glob("*/checkpoint.pt")).replace(target)
+        shutil.rmtree(trained)
+    for path, text in (
+        (args.runs / f"logs/{step.name}.txt", result.stdout),
+        (note(step, args), json.dumps({"seconds": time.time() - tick})),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(f".{os.getpid()}")
+        temporary.write_text(text)
+        temporary.replace(path)
+    return step.name, None
+
+
+def wanted(steps, only):
+    """The steps named and what they need, in order. Raises ValueError for a name that is none."""
+    by_name, chosen, names = {step.name: step for step in steps}, set(), list(only or (step.name for step in steps))
+    while names:
+        name = names.pop()
+        if name not in by_name:
+            raise ValueError(f"--only {name} is not a step; choose from {', '.join(by_name)}")
+        if name not in chosen:
+            chosen.add(name)
+            names += by_name[name].needs
+    return [step for step in steps if step.name in chosen]
+
+
+def waves(steps):
+    """Lists of steps that may run side by side, one after another: first what need not be alone, as early as its needs allow."""
+    done, left = set(), list(steps)
+    while left:
+        ready = [step for step in left if done.issuperset(step.needs)]
+        wave = [step for step in ready if not step.alone] or ready[:1]
+        yield wave
+        done |= {step.name for step in wave}
+        left = [step for step in left if step.name not in done]
+
+
+def main(args, steps=STEPS):
+    if not 1 <= args.jobs <= 1024:
+        cells.fail(f"--jobs is {args.jobs}; it must lie in 1 to 1024")
+    if (args.backend == "dask") != bool(args.scheduler):
+        cells.fail("--backend dask and --scheduler ADDRESS belong together")
+    if args.quick and args.out.resolve() == HERE:
+        cells.fail("--quick would replace the committed results by those of tiny budgets; name another folder with --out")
+    args.runs, args.out = args.runs.absolute(), args.out.absolute()
+    try:
+        steps = wanted(steps, args.only)
+        for folder in (args.runs, args.out):
+            folder.mkdir(parents=True, exist_ok=True)
+    except ValueError as error:
+        cells.fail(error)
+    except OSError as error:
+        cells.fail(f"--runs {args.runs} or --out {args.out}: cannot write there ({error.strerror})")
+    if args.list:
+        for step in steps:
+            state = "done" if note(step, args).exists() else f"{step.minutes:g} min"
+            print(f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else ''}{'needs ' + ', '.join(step.needs) if step.needs else ''}")
+        return
+    settings = dict(backend="loky", n_jobs=args.jobs)
+    if args.backend == "dask":
+        from dask.distributed import Client
+
+        try:
+            client = Client(args.scheduler, timeout=20)  # joblib's dask backend finds it
+        except (OSError, ValueError) as error:
+            cells.fail(f"--scheduler {args.scheduler} does not answer ({error})")
+        settings = dict(backend="dask")
+    minutes, failed = {step.name: step.minutes for step in steps}, []
+    with tqdm(total=sum(minutes.values()), disable=None, bar_format="{l_bar}{bar}| {remaining} left{postfix}") as bar:
+        for wave in waves(steps):
+            with joblib.parallel_config(**settings):
+                results = joblib.Parallel(return_as="generator_unordered")(joblib.delayed(run)(step, args) for step in wave)
+                for name, error in results:
+                    bar.set_postfix_str(f", {name} {'failed' if error else 'done'}")
+                    bar.update(minutes[name])
+                    failed += [f"{name}: {error}"] if error else []
+            if failed:
+                break
+    if args.backend == "dask":
+        client.close()
+    if failed:
+        cells.fail("\n\n".join(failed))
+    print(f"{len(steps)} steps done; results in {args.out}")
+
+
+if __name__ == "__main__":
+    cells.run(main, tyro.cli(Args, description=__doc__))

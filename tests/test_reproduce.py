@@ -1,0 +1,108 @@
+"""The whole reproduction: what it runs, in which order, and that nothing is lost on the way."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "experiments"))
+import reproduce  # noqa: E402
+
+# notes when it began in a file of its own, works for a while, writes a result
+WORK = """
+import os, sys, time
+from pathlib import Path
+name, out = sys.argv[1], Path(sys.argv[sys.argv.index("--out") + 1])
+(out / f"{name}.{os.getpid()}.started").touch()
+time.sleep(1.0)
+temporary = out / f"{name}.{os.getpid()}"
+temporary.write_text(name)
+temporary.replace(out / f"{name}.csv")
+sys.exit(name == "bad")
+"""
+
+
+@pytest.fixture
+def settings(tmp_path):
+    (tmp_path / "work.py").write_text(WORK)
+    (tmp_path / "out").mkdir()
+    return reproduce.Args(runs=tmp_path / "runs", out=tmp_path / "out")
+
+
+def steps(settings, *names, needs=()):
+    return [reproduce.Step(name, (str(settings.runs.parent / "work.py"), name), 1.0, needs) for name in names]
+
+
+def started(settings):
+    return sorted(path.name.split(".")[0] for path in settings.out.glob("*.started"))
+
+
+def test_every_table_and_figure_has_a_step():
+    """Each script with a figure or a table of its own is run, with every study it knows."""
+    commands = {" ".join(step.command) for step in reproduce.STEPS}
+    for path in (ROOT / "experiments").glob("*.py"):
+        text = path.read_text()
+        if "class Args" not in text or path.stem == "reproduce":
+            continue
+        line = next((line for line in text.splitlines() if "study: Literal[" in line), None)
+        studies = json.loads(line[line.index("[") : line.index("]") + 1]) if line else [None]
+        for study in studies:
+            plain, named = f"experiments/{path.name}", f"experiments/{path.name} --study {study}"
+            assert named in commands or (study in (None, studies[0]) and plain in commands), named
+    trained = {step.name.removeprefix("critic_") for step in reproduce.STEPS if step.name.startswith("critic_")}
+    assert trained == {path.stem for path in (ROOT / "experiments/pretrained").glob("*.pt")}
+
+
+def test_waves_respect_needs_and_leave_alone_what_measures_times():
+    done = set()
+    for wave in reproduce.waves(reproduce.STEPS):
+        assert all(done.issuperset(step.needs) for step in wave)
+        assert len(wave) == 1 or not any(step.alone for step in wave)
+        done |= {step.name for step in wave}
+    assert len(done) == len(reproduce.STEPS)
+    chosen = [step.name for step in reproduce.wanted(reproduce.STEPS, ("cstr_frontier",))]
+    assert chosen == [*reproduce.CRITICS, "cstr_deploy", "cstr_oracle", "cstr_frontier"]
+
+
+def test_a_finished_step_is_not_repeated_and_a_failed_one_is(settings, capsys):
+    reproduce.main(settings, steps(settings, "a", "b"))
+    with pytest.raises(SystemExit):
+        reproduce.main(settings, steps(settings, "a", "b", "bad"))
+    with pytest.raises(SystemExit):
+        reproduce.main(settings, steps(settings, "bad") + steps(settings, "c", needs=("bad",)))
+    assert started(settings) == ["a", "b", "bad", "bad"] and "work.py bad" in capsys.readouterr().err
+
+
+def test_a_lost_worker_loses_no_result_and_doubles_none(settings):
+    from dask.distributed import Client, LocalCluster
+
+    names = [f"s{i}" for i in range(8)]
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        settings.backend, settings.scheduler = "dask", cluster.scheduler_address
+        thread = threading.Thread(target=reproduce.main, args=(settings, steps(settings, *names)))
+        thread.start()
+        while len(started(settings)) < 3:
+            time.sleep(0.05)
+        with Client(cluster) as client:
+            victim = next(iter(client.run(os.getpid).values()))
+        os.kill(victim, signal.SIGKILL)
+        thread.join(timeout=60)
+        assert not thread.is_alive()
+    assert {path.stem: path.read_text() for path in settings.out.glob("*.csv")} == {name: name for name in names}
+    assert len(list((settings.runs / "done").iterdir())) == len(names) and len(started(settings)) > len(names)
+
+
+def test_the_command_line(settings, capsys):
+    reproduce.main(reproduce.Args(list=True, only=("cstr_frontier",), runs=settings.runs, out=settings.out))
+    assert "needs cstr_oracle" in capsys.readouterr().out
+    bad = dict(only=("nothing",)), dict(jobs=0), dict(quick=True, out=reproduce.HERE), dict(backend="dask"), dict(scheduler="tcp://x:1")
+    for options in bad:
+        with pytest.raises(SystemExit):
+            reproduce.main(reproduce.Args(**dict(runs=settings.runs, out=settings.out) | options))
+        assert "--" + next(iter(options)) in capsys.readouterr().err
