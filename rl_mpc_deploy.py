@@ -90,6 +90,14 @@ class Args:
     """RL+MPC: V itself, or its concave second-order expansion about the goal, or about where each scenario's first guess ends"""
     combine: Literal["min", "first", "mean"] = "first"
     """which of the twin critics V takes; their minimum has kinks, where the solver stalls"""
+    offset_free: bool = False
+    """every controller that predicts: estimate from the last transitions how the plant differs from the model (see `envs.Estimator`)"""
+    estimate: Literal["disturbance", "parameters"] = "disturbance"
+    """what --offset-free estimates: what to add to every prediction, or the uncertain parameters, on which the scenarios are centred"""
+    filter_gain: float = 1.0
+    """how far an estimate follows the last transitions, 1: wholly; less where measurements are noisy"""
+    spread: float | None = None
+    """size of the scenario set about its centre; default: 1, the plant's, with --offset-free 0.5, since the estimate explains part of it"""
     controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
@@ -138,7 +146,9 @@ class Critic:
     """Actor and twin critics of a checkpoint in float64: float32 noise (1e-6 at |V| = 40) is above the solver's tolerance."""
 
     def __init__(self, data, combine):
-        self.plant = envs.load(data["env"], **data.get("plant_options", {}))
+        options = dict(data.get("plant_options", {}))
+        self.observes_mismatch = options.pop("observe_mismatch", False)
+        self.plant = envs.load(data["env"], **options)
         self.network, self.goal_input, self.combine = data["network"], data["goal_input"], combine
         self.slack_weight = 2.0 if data["args"].get("constraint_weight") else 1.0  # the default price in a plan that ends in this value
         self.actor, self.critic = Actor(**self.network).double(), TwinCritic(**self.network).double()
@@ -148,7 +158,10 @@ class Critic:
         self.scaling = {k: np.array(v, dtype=int if k.endswith("index") else float) for k, v in data["scaling"].items()}
 
     def features(self, x, goal, xp):
-        """Network input, components along the first axis, xp torch or casadi: x (n_x, B), goal (n_goal, B) -> (n_in, B)."""
+        """Network input, components along the first axis, xp torch or casadi: x (n_x, B), goal (n_goal, B) -> (n_in, B).
+
+        x of a critic that observes the mismatch has it below the state.
+        """
         concat = torch.cat if xp is torch else lambda parts: ca.vertcat(*parts)
         s = {k: v.tolist() if v.dtype == int else v if xp is ca else torch.from_numpy(v)[:, None] for k, v in self.scaling.items()}
         if self.goal_input == "error":
@@ -201,7 +214,10 @@ def layers(critic):
 
 
 def export(critic):
-    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64."""
+    """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64.
+
+    Of a critic that observes the mismatch each takes it, (n_x,), as one more argument.
+    """
 
     def mlp(layers, h):
         for w, b in layers[:-1]:
@@ -210,13 +226,15 @@ def export(critic):
         return layers[-1][0] @ h + layers[-1][1]
 
     s, (actor, twins) = critic.scaling, layers(critic)
-    x, goal, u = (ca.MX.sym(name, n) for name, n in (("x", s["x_center"].size), ("goal", s["goal_center"].size), ("u", s["u_center"].size)))
-    z = critic.features(x, goal, ca)
-    mu = ca.Function("mu", [x, goal], [ca.tanh(mlp(actor, z)) * s["u_scale"] + s["u_center"]])
+    n_x = len(critic.plant.X_LOW)
+    x, goal, u = (ca.MX.sym(name, n) for name, n in (("x", n_x), ("goal", s["goal_center"].size), ("u", s["u_center"].size)))
+    seen = [ca.MX.sym("mismatch", n_x)] if critic.observes_mismatch else []
+    z = critic.features(ca.vertcat(x, *seen), goal, ca)
+    mu = ca.Function("mu", [x, goal, *seen], [ca.tanh(mlp(actor, z)) * s["u_scale"] + s["u_center"]])
     q = [mlp(twin, ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])) for twin in twins]
     combined = {"min": ca.fmin(*q), "first": q[0], "mean": (q[0] + q[1]) / 2}[critic.combine]
-    Q = ca.Function("Q", [x, u, goal], [combined])
-    V = ca.Function("V", [x, goal], [Q(x, mu(x, goal), goal)], ["x", "goal"], ["V"])
+    Q = ca.Function("Q", [x, u, goal, *seen], [combined])
+    V = ca.Function("V", [x, goal, *seen], [Q(x, mu(x, goal, *seen), goal, *seen)], ["x", "goal", "mismatch"][: 2 + len(seen)], ["V"])
     return mu, Q, V
 
 
@@ -315,13 +333,14 @@ def check_export(critic, V, points=64, tolerance=1e-8):
     plant, rng = critic.plant, np.random.default_rng(0)
     x = torch.tensor(envs.sample_states(plant, rng, points), requires_grad=True)
     goal = torch.tensor(rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW))))
-    value = critic.value(x, goal)
+    seen = [torch.tensor(rng.uniform(-1, 1, size=x.shape))] if critic.observes_mismatch else []
+    value, x_scale = critic.value(torch.cat([x, *seen], dim=1), goal), critic.scaling["x_scale"][: x.shape[1]]
     (gradient,) = torch.autograd.grad(value.sum(), x)
-    gradient = gradient.numpy() * critic.scaling["x_scale"]  # per unit of the network's input, as the value is
-    xs, gs = ca.MX.sym("x", V.size1_in(0)), ca.MX.sym("goal", V.size1_in(1))
-    both = ca.Function("both", [xs, gs], [V(xs, gs), ca.gradient(V(xs, gs), xs)]).map(points)
-    v, dv = (np.array(a) for a in both(x.detach().numpy().T, goal.numpy().T))
-    dv = dv.T * critic.scaling["x_scale"]
+    gradient = gradient.numpy() * x_scale  # per unit of the network's input, as the value is
+    inputs = [ca.MX.sym(V.name_in(i), V.size1_in(i)) for i in range(V.n_in())]
+    both = ca.Function("both", inputs, [V(*inputs), ca.gradient(V(*inputs), inputs[0])]).map(points)
+    v, dv = (np.array(a) for a in both(*(value.detach().numpy().T for value in (x, goal, *seen))))
+    dv = dv.T * x_scale
     value = value.detach().numpy()
     worst = max(np.abs(v[0] - value).max(), np.abs(dv - gradient).max()) / (1 + np.abs(value).max())
     if not worst < tolerance:
@@ -420,13 +439,15 @@ class ScenarioMPC:
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
     taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: the state (n_x,) to expand at, or
     None for where each scenario's guess ends.
+    estimator: an `envs.Estimator`, whose disturbance predictions add and whose shift of the parameters centres the scenarios; default:
+    of the kind that estimates nothing. terminal_cost and actor may take its mismatch, (n_x,), as a third argument.
     barrier: IPOPT's barrier parameter at the start of a warm solve, or "adaptive" (mu_strategy, of every solve). A smaller one saves
     iterations and leaves fewer local optima: at 1e-7 the benchmarks are twice as fast and stuck more often.
     """
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
-                 relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, barrier=1e-4, tol=1e-6,
-                 compile=True):  # fmt: skip
+                 relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, estimator=None, barrier=1e-4,
+                 tol=1e-6, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
@@ -446,6 +467,7 @@ class ScenarioMPC:
         self.theta = np.empty((0, self.nodes[-1])) if taylor is None else taylor.parameters(np.zeros((self.n_x, self.nodes[-1])))
         if expand_at is not None:
             self.theta[:] = taylor.parameters(np.asarray(expand_at)[:, None])
+        self.estimator = estimator or envs.Estimator(plant)
         self._build_problem()
         self._build_solvers(compile, tol)
         self.reset()
@@ -465,7 +487,8 @@ class ScenarioMPC:
         theta = ca.MX.sym("theta", *self.theta.shape)  # of the terminal value's expansion at every leaf
         w, lbw, ubw, J, g, lbg, ubg = [], [], [], 0, [], [], []
         self.layout = {}  # (name, stage): first index into w or g, rows, nodes
-        step = self._model_step()
+        self.step = self._model_step()
+        memory = [ca.MX.sym(name, len(value)) for name, value in self.estimator.memory().items()]  # held over the horizon
 
         def variable(name, t, rows, nodes, low, high):
             self.layout[name, t] = sum(v.numel() for v in w), rows, nodes
@@ -488,31 +511,42 @@ class ScenarioMPC:
             # x_{t+1} = f(x_t, u_t, psi)
             x_next = variable("x", t + 1, n_x, n_next, -np.inf, np.inf) * self.x_scale + self.x_center
             parent = self.parent[t + 1].tolist()
-            predicted = step.map(n_next)(x[:, parent], u[:, parent], self.psi[t + 1])
+            predicted = self.predict(x[:, parent], u[:, parent], t + 1, *memory[:2])
             constrain("dynamics", t + 1, (predicted - x_next) / self.x_scale, 0.0, 0.0)
             # X_LOW <= x_{t+1} + below - above <= X_HIGH, slack >= 0; a hard bound is a slack fixed at zero
             below = variable("below", t + 1, n_x, n_next, 0.0, np.inf)
             above = variable("above", t + 1, n_x, n_next, 0.0, np.inf)
             constrain("box", t + 1, (x_next - self.x_center) / self.x_scale + below - above, *self.box)
             slack_cost = (price[:, 0] * self.x_scale).T @ below + (price[:, 1] * self.x_scale).T @ above  # (1, nodes)
-            J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost)
+            J += self.node_cost(t + 1, x_next, ca.repmat(goal, 1, n_next), slack_cost, *memory[2:])
             change = u - (u_parent if t == 0 else u_parent[:, self.parent[t].tolist()])
             # not averaged, as in the reference: every action's change counts once for each scenario that passes through its node
             J += self.nodes[-1] / n * ca.sum2(ca.DM(self.change_weight).T @ change**2)
             x, u_parent = x_next, u
         if self.taylor is not None:
             J += ca.sum2(self.taylor.cost.map(self.nodes[-1])(x, theta)) / self.nodes[-1]
-        self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price, theta), "f": J, "g": ca.veccat(*g)}
+        self.nlp = {"x": ca.veccat(*w), "p": ca.veccat(x_now, goal, u_before, price, theta, *memory), "f": J, "g": ca.veccat(*g)}
         self.bounds = {"lbx": np.concatenate(lbw), "ubx": np.concatenate(ubw), "lbg": np.concatenate(lbg), "ubg": np.concatenate(ubg)}
         self.known_bounds = {}  # of `_bounds`, by slack price
         self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [J])
-        self.step = step
 
-    def node_cost(self, t, x, goal, slack_cost):
-        """Cost of stage t, averaged over its nodes: x (n_x, nodes), goal (n_goal, nodes), slack_cost (1, nodes)."""
+    def predict(self, x, u, t, disturbance=None, shift=None):
+        """The nodes of stage t, (n_x, nodes), from their parents' states and actions and what is estimated."""
+        n = x.shape[1]
+        if shift is None:
+            return self.step.map(n)(x, u, self.psi[t])
+        return self.step.map(n)(x, u, self.psi[t] + ca.repmat(shift, 1, n)) + ca.repmat(disturbance, 1, n)
+
+    def policy(self, x):
+        """The actor's actions at the states x (n_x, points)."""
+        return np.array(self.actor(x, self.goal, *([self.estimator.mismatch] if self.actor.n_in() == 3 else [])))
+
+    def node_cost(self, t, x, goal, slack_cost, mismatch=None):
+        """Cost of stage t, averaged over its nodes: x (n_x, nodes), goal (n_goal, nodes), slack_cost (1, nodes), mismatch (n_x,)."""
         cost = slack_cost + self.stage_cost.map(x.shape[1])(x, goal)
         if t == self.horizon and self.terminal_cost is not None:
-            cost += self.terminal_cost.map(x.shape[1])(x, goal)  # at every leaf
+            seen = [ca.repmat(mismatch, 1, x.shape[1])] if self.terminal_cost.n_in() == 3 else []
+            cost += self.terminal_cost.map(x.shape[1])(x, goal, *seen)  # at every leaf
         return ca.sum2(cost) / x.shape[1]
 
     def _model_step(self):
@@ -566,6 +600,7 @@ class ScenarioMPC:
         self.x_before = self.x_compared = None  # the state of the previous step, and that at which guesses were last compared
         self.last_w = None
         self.stats = {}
+        self.estimator.reset()
 
     def block(self, w, name, t):
         """A view (rows, nodes) of the variables or constraints `name` of stage t in a vector like w or g, scaled units."""
@@ -580,11 +615,11 @@ class ScenarioMPC:
     def _rollout(self, x0, action):
         """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
         w = np.zeros(self.nlp["x"].numel())
-        x = np.asarray(x0, dtype=float)[:, None]
+        x, memory = np.asarray(x0, dtype=float)[:, None], list(self.estimator.memory().values())[:2]
         for t in range(self.horizon):
             u = np.clip(action(t, x), self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None])
             parent = self.parent[t + 1]
-            x = np.array(self.step(x[:, parent], u[:, parent], self.psi[t + 1]))
+            x = np.array(self.predict(x[:, parent], u[:, parent], t + 1, *memory))
             scaled = (x - self.x_center[:, None]) / self.x_scale[:, None]
             self.block(w, "u", t)[:] = (u - self.u_center[:, None]) / self.u_scale[:, None]
             self.block(w, "x", t + 1)[:] = scaled
@@ -602,7 +637,7 @@ class ScenarioMPC:
     def cold_guess(self, x0):
         """A plan from nothing: the rollout through the scenarios of the actor, or of the plant's own feedback, or `hold_guess`."""
         if self.actor is not None:
-            return self._rollout(x0, lambda t, x: np.array(self.actor(x, self.goal)))
+            return self._rollout(x0, lambda t, x: self.policy(x))
         if hasattr(self.plant, "baseline"):
             return self._rollout(x0, lambda t, x: self.plant.baseline(x, self.goal[:, None]))
         return self.hold_guess(x0)
@@ -613,7 +648,8 @@ class ScenarioMPC:
         self.plan, self.plan_left, self.last = None, 0, None
 
     def _parameters(self, x0, price):
-        return np.concatenate([x0, self.goal, self.u_before, np.where(np.isinf(price), 0.0, price).ravel(), self.theta.ravel("F")])
+        price = np.where(np.isinf(price), 0.0, price).ravel()
+        return np.concatenate([x0, self.goal, self.u_before, price, self.theta.ravel("F"), *self.estimator.memory().values()])
 
     def _bounds(self, price):
         """Bounds of the problem under a slack price: slack is fixed at zero where a bound is hard (inf) or ignored (0)."""
@@ -666,6 +702,7 @@ class ScenarioMPC:
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
+        self.estimator.update(x0)
         start, guess, moved = "warm", self.last, np.inf if self.last is None else np.abs((x0 - self.x_before) / self.x_scale).max()
         # where the plant has hardly moved since the guesses were last compared, the last plan itself is the best one
         if self.last is None or (np.abs(x0 - self.x_compared) > 1e-3 * self.x_scale).any():
@@ -705,8 +742,9 @@ class ScenarioMPC:
             self.plan_left -= 1
         else:
             self.stats["rung"], self.plan = "actor", None
-            u = np.array(self.actor(x0, self.goal)).ravel() if self.actor is not None else self.u_before
+            u = self.policy(x0).ravel() if self.actor is not None else self.u_before
         self.u_before = np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
+        self.estimator.before = x0, self.u_before
         self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
         return self.u_before.copy()
 
@@ -721,21 +759,29 @@ class ScenarioMPC:
 class ActorController:
     """The learned policy alone, with the interface of ScenarioMPC."""
 
-    def __init__(self, plant, actor, goal):
-        self.plant, self.actor, self.goal = plant, actor, np.array(goal, dtype=float)
-        self.stats = {}
+    def __init__(self, plant, actor, goal, estimator=None):
+        self.plant, self.actor, self.goal, self.estimator = plant, actor, np.array(goal, dtype=float), estimator or envs.Estimator(plant)
+        self.reset()
 
     def reset(self):
         self.stats = {}
+        self.estimator.reset()
 
     def set_initial_guess(self, x0):
         """Nothing to guess."""
 
     def make_step(self, x0):
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
-        u = np.array(self.actor(x0, self.goal)).ravel()
+        self.estimator.update(x0)
+        seen = [self.estimator.mismatch] if self.actor.n_in() == 3 else []
+        u = np.clip(self.act(x0, *seen), self.plant.U_LOW, self.plant.U_HIGH)
+        self.estimator.before = x0, u
         self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
-        return np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
+        return u
+
+    def act(self, x0, *seen):
+        """The action before it is clipped, (n_u,); seen: the mismatch (n_x,), if the networks take it."""
+        return np.array(self.actor(x0, self.goal, *seen)).ravel()
 
 
 class GreedyController(ActorController):
@@ -744,29 +790,28 @@ class GreedyController(ActorController):
     The points are a grid for one or two actions, random for more.
     """
 
-    def __init__(self, plant, actor, Q, goal, points=9):
-        super().__init__(plant, actor, goal)
+    def __init__(self, plant, actor, Q, goal, estimator=None, points=9):
+        super().__init__(plant, actor, goal, estimator)
         x, v = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("v", len(plant.U_LOW))  # v: action scaled to [0, 1]
-        q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), self.goal)
-        self.negative_q = ca.Function("negative_q", [v, x], [-q, -ca.gradient(q, v)])
+        seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if actor.n_in() == 3 else []
+        q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), self.goal, *seen)
+        self.negative_q = ca.Function("negative_q", [v, x, *seen], [-q, -ca.gradient(q, v)])
         if v.numel() <= 2:
             self.points = np.stack([a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, points)] * v.numel())])  # (n_u, points^n_u)
         else:
             self.points = np.random.default_rng(0).uniform(size=(v.numel(), points**2))
 
-    def make_step(self, x0):
-        x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
+    def act(self, x0, *seen):
         span = self.plant.U_HIGH - self.plant.U_LOW
-        at_points = np.array(self.negative_q(self.points, x0)[0]).ravel()
-        starts = [(np.array(self.actor(x0, self.goal)).ravel() - self.plant.U_LOW) / span, self.points[:, at_points.argmin()]]
+        at_points = np.array(self.negative_q(self.points, x0, *seen)[0]).ravel()
+        starts = [(super().act(x0, *seen) - self.plant.U_LOW) / span, self.points[:, at_points.argmin()]]
 
         def objective(v):
-            value, gradient = self.negative_q(v, x0)
+            value, gradient = self.negative_q(v, x0, *seen)
             return float(value), np.array(gradient).ravel()
 
         results = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(span)) for start in starts]
         best = min(results, key=lambda result: result.fun)
-        self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
         return self.plant.U_LOW + np.clip(best.x, 0, 1) * span
 
 
@@ -778,19 +823,24 @@ def build_controller(name, args):
     compile = args.compile and not hasattr(plant, "next_state")
     mu, Q, V = export(critic)
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
+    observed = "mismatch" if critic.observes_mismatch else None
+    estimator = envs.Estimator(plant, args.estimate if args.offset_free else observed, args.filter_gain)
     if name == "actor":
-        return ActorController(plant, mu, goal)
+        return ActorController(plant, mu, goal, estimator)
     if greedy:
-        return GreedyController(plant, mu, Q, goal)
+        return GreedyController(plant, mu, Q, goal, estimator)
+    spread = (0.5 if args.offset_free else 1.0) if args.spread is None else args.spread
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
-    squared_error, scenarios = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca)), plant.SCENARIOS["mpc"]
+    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
+    scenarios = plant.PSI_NOMINAL + spread * (plant.SCENARIOS["mpc"] - plant.PSI_NOMINAL)
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        learned, expansion = {}, Expansion(critic)
+        learned, expansion = {}, None if critic.observes_mismatch else Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
-            V = V if compile else with_derivatives(V, expansion)
-            learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g], [-V(x, g)]))
+            V = V if compile or expansion is None else with_derivatives(V, expansion)
+            seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if critic.observes_mismatch else []
+            learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g, *seen], [-V(x, g, *seen)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
             learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
@@ -798,14 +848,15 @@ def build_controller(name, args):
         barrier = "adaptive" if learned else 1e-4
         slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
-                          barrier=barrier, slack_price=slack_weight if args.constraints == "soft" else np.inf, **learned)  # fmt: skip
+                          barrier=barrier, slack_price=slack_weight if args.constraints == "soft" else np.inf, estimator=estimator,
+                          **learned)  # fmt: skip
         mpc.expansion = expansion
         return mpc
     robust, benchmark = name == "robust_mpc", plant.BENCHMARK
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
-                       compile=compile)  # fmt: skip
+                       compile=compile, estimator=estimator)  # fmt: skip
 
 
 def settled_state(plant, mu, goal, steps=1000):
@@ -984,7 +1035,8 @@ def check(args):
     if args.env not in envs.names():
         fail(f"--env {args.env!r} is not a plant of envs/; choose one of {', '.join(envs.names())}")
     ranges = {"horizon": (0, 1000), "robust_horizon": (0, 10), "episodes": (1, 10**6), "steps": (1, 10**6), "jobs": (1, 1024),
-              "seed": (0, 10**9), "sigma": (1e-6, 1e6), "slack_weight": (1e-6, 1e6)}  # fmt: skip
+              "seed": (0, 10**9), "sigma": (1e-6, 1e6), "slack_weight": (1e-6, 1e6), "filter_gain": (1e-6, 1),
+              "spread": (0, 10)}  # fmt: skip
     for name, (least, most) in ranges.items():
         if getattr(args, name) is not None and not least <= getattr(args, name) <= most:  # catches nan too
             fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in [{least:g}, {most:g}]")
@@ -998,6 +1050,8 @@ def check(args):
         critic = load_critic(critic_path(args), args.env, args.combine)
     except ValueError as error:
         fail(f"--critic {error}")
+    if critic.observes_mismatch and args.value != "exact":
+        fail(f"--value is {args.value}; a critic that observes the mismatch needs exact")
     plant = critic.plant
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
     if leaves > 1000:

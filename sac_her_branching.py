@@ -61,6 +61,11 @@ class Args:
     """plants simulated in parallel; default: the plant's (cstr: 32, linear: 64)"""
     scenarios: Literal["robust", "nominal", "mpc"] = "robust"
     """where psi is drawn from at every step: the training grid, the nominal plant, or the MPC's scenario set"""
+    scenario_hold: Literal["step", "episode"] = "step"
+    """how long a scenario lasts: drawn anew at every step, as in the paper, or once per episode"""
+    observe_mismatch: bool = False
+    """let the agent see how the last transition differed from the nominal model, which tells what plant it is on (with
+    --scenario-hold episode)"""
     branches: int = 1
     """K, next states per transition whose targets are averaged; 1 is the paper's sampling: the one that the episode follows"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -125,14 +130,20 @@ class Args:
     def __post_init__(self):
         """Arguments left out take the plant's value."""
         if self.env in envs.names():
-            for name, value in (DEFAULTS | envs.load(self.env).TRAINING).items():
+            defaults = DEFAULTS | envs.load(self.env).TRAINING
+            for name, value in (defaults | ({"gamma": min(defaults["gamma"], 0.95)} if self.observe_mismatch else {})).items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
 
     @property
     def plant_options(self):
         """What `envs.load` needs beside the plant's name."""
-        return {name: getattr(self, name) for name in ("dim", "system") if getattr(self, name) is not None}
+        return plant_options(vars(self))
+
+
+def plant_options(args):
+    """What `envs.load` needs beside the plant's name, of arguments as a dictionary."""
+    return {name: args[name] for name in ("dim", "system", "observe_mismatch") if args[name] is not None and args[name] is not False}
 
 
 # Networks. They see normalised inputs; `Scaling` is the only place where physical units are left and entered.
@@ -149,7 +160,8 @@ class Scaling:
     @classmethod
     def of(cls, plant, device="cpu"):
         def affine(name, low, high):
-            return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": ((high - low) / 2).tolist()}
+            half = np.where(high > low, (high - low) / 2, 1.0)  # a mismatch starts at zero and has unit scale already
+            return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": half.tolist()}
 
         i, n_x = plant.GOAL_INDEX, len(plant.INIT_LOW)
         goals = affine("goal", plant.INIT_LOW[i], plant.INIT_HIGH[i])
@@ -231,20 +243,26 @@ class Policy:
     def __init__(self, plant, actor, critic, scaling, goal_input):
         self.plant, self.actor, self.critic, self.scaling, self.goal_input = plant, actor, critic, scaling, goal_input
 
-    def _features(self, x, goal):
-        x = torch.as_tensor(np.atleast_2d(x), dtype=torch.float32, device=self.scaling.x_center.device)
+    def _features(self, x, goal, mismatch=None):
+        x = np.atleast_2d(x)
+        if x.shape[1] < len(self.plant.X_LOW):  # of an agent that observes the mismatch
+            x = np.hstack([x, np.zeros_like(x) if mismatch is None else np.broadcast_to(mismatch, x.shape)])
+        x = torch.as_tensor(x, dtype=torch.float32, device=self.scaling.x_center.device)
         goal = torch.as_tensor(np.atleast_2d(goal), dtype=torch.float32, device=x.device).expand(len(x), -1)
         return self.scaling.features(x, goal, self.goal_input)
 
     @torch.no_grad()
-    def act(self, x, goal):
-        """Deterministic action u = mu(x, goal), (B, n_x) and (n_goal,) or (B, n_goal) -> (B, n_u), physical units."""
-        return (self.actor.act(self._features(x, goal)) * self.scaling.u_scale + self.scaling.u_center).cpu().numpy()
+    def act(self, x, goal, mismatch=None):
+        """Deterministic action u = mu(x, goal), (B, n_x) and (n_goal,) or (B, n_goal) -> (B, n_u), physical units.
+
+        An agent that observes the mismatch takes it, (n_x,) or (B, n_x), default zero, or as further columns of x.
+        """
+        return (self.actor.act(self._features(x, goal, mismatch)) * self.scaling.u_scale + self.scaling.u_center).cpu().numpy()
 
     @torch.no_grad()
-    def value(self, x, goal):
+    def value(self, x, goal, mismatch=None):
         """V(x, goal) = min_j Q_j(x, mu(x, goal), goal), (B,). It contains SAC's entropy bonus unless trained without."""
-        z = self._features(x, goal)
+        z = self._features(x, goal, mismatch)
         return self.critic(z, self.actor.act(z)).amin(0).cpu().numpy()
 
 
@@ -470,7 +488,7 @@ def checkpoint(agent, args, step):
     return {
         "format": "rlmpc-sac-her-branching-1",
         "env": args["env"],
-        "plant_options": {name: args[name] for name in ("dim", "system") if args[name] is not None},
+        "plant_options": plant_options(args),
         "env_id": agent.plant.ENV_ID,
         "network": agent.network,
         "goal_input": args["goal_input"],
@@ -522,6 +540,8 @@ def check(args):
     size = len(plant.X_LOW) * (2 + (args.branches if args.branches > 1 else 0)) + len(plant.U_LOW) + len(plant.GOAL_INDEX) + 4
     if args.buffer_size > 10**10 // (4 * size):
         fail(f"--buffer-size is {args.buffer_size}; at most {10**10 // (4 * size)} transitions are allowed, ten gigabytes")
+    if args.observe_mismatch and args.branches > 1:
+        fail(f"--branches is {args.branches}; --observe-mismatch needs 1, since the average over plants is not that of the plant it sees")
     if args.add_plant_data and args.branches > 1:
         fail(f"--branches is {args.branches}; --add-plant-data needs 1, since a plant gives one next state per action")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -582,7 +602,8 @@ def main(args):
 
     vec = gym.make_vec(plant.ENV_ID, num_envs=args.num_envs, scenarios=args.scenarios, smooth_reward=args.smooth_reward,
                        reward_sigma2=args.reward_sigma2, reward_tolerance=args.reward_tolerance,
-                       branches=args.branches if args.branches > 1 else 0, **args.plant_options).unwrapped  # fmt: skip
+                       branches=args.branches if args.branches > 1 else 0, scenario_hold=args.scenario_hold,
+                       **args.plant_options).unwrapped  # fmt: skip
     agent = SAC(args, plant, device)
     buffer = HERBuffer(args.buffer_size, args.num_envs, len(plant.X_LOW), len(plant.U_LOW), len(plant.GOAL_INDEX),
                        plant.GOAL_INDEX, args.branches, args.her_strategy, args.her_ratio, device)  # fmt: skip

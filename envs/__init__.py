@@ -21,6 +21,7 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
     TRAINING                                      arguments of sac_her_branching.py whose defaults it changes, {} for none
 optional: held_action(goal), the action (n_u,) that holds a goal, infinite if none does, where a box cannot tell
+optional, for observe_mismatch: MISMATCH_SCALE, size of a large difference between model and plant after one step, (n_x,)
 optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE_WEIGHT (another objective), animate(...)
 
 A family of plants (`envs/linear.py`) defines `make(dim, system)` instead, which returns an object with these names. A plant in discrete
@@ -68,10 +69,93 @@ def names():
     return sorted(module.name for module in pkgutil.iter_modules(__path__))
 
 
-def load(name, **options):
+class Mismatch:
+    """A plant whose observation (2 n_x,) is its state and how the last transition differed from the nominal model, zero at the first step:
+
+        m_t = tanh((x_t - f(x_{t-1}, u_{t-1}, psi nominal)) / MISMATCH_SCALE)
+
+    One state does not tell which plant it comes from; one transition does. Everything but the state is the plant's.
+    """
+
+    def __init__(self, plant):
+        if not hasattr(plant, "MISMATCH_SCALE"):
+            raise ValueError(f"--observe-mismatch: {plant.ENV_ID} has no MISMATCH_SCALE")
+        self.plant, n = plant, len(plant.X_LOW)
+        extra = {"X_LOW": -np.inf, "X_HIGH": np.inf, "INIT_LOW": 0.0, "INIT_HIGH": 0.0, "OBS_LOW": -1.0, "OBS_HIGH": 1.0}
+        for name, value in extra.items():
+            setattr(self, name, np.append(getattr(plant, name), np.full(n, value)))
+
+    def __getattr__(self, name):
+        return getattr(self.plant, name)
+
+    def step(self, x, u, psi):
+        x = np.asarray(x)[..., : len(self.plant.X_LOW)]
+        x_next, nominal = self.plant.step(x, u, psi), self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi)))
+        return np.concatenate([x_next, np.tanh((x_next - nominal) / self.plant.MISMATCH_SCALE)], axis=-1)
+
+
+class Estimator:
+    """What the last transitions tell about a plant, for predictions without steady-state offset. Of the kinds
+
+    "disturbance": what one transition adds to the nominal model, x_t - f(x_{t-1}, u_{t-1}, nominal), which every prediction then adds:
+        the classic construction (Pannocchia and Rawlings, AIChE Journal 49(2), 2003), here with the whole state measured.
+    "parameters": psi by least squares over the last `window` transitions, within twice the box of the MPC's scenarios.
+    "mismatch": neither, only what an agent that observes the `Mismatch` sees (which the others tell too).
+    None: nothing.
+
+    Attributes: disturbance (n_x,) and shift (n_psi,) = psi - nominal, physical units; mismatch (n_x,), zero where the plant has no
+    MISMATCH_SCALE. Each follows what the last transitions say by `gain`.
+    """
+
+    def __init__(self, plant, kind=None, gain=1.0, window=5):
+        self.plant, self.kind, self.gain, self.window = plant, kind, gain, window
+        self.reset()
+
+    def reset(self):
+        """Forget everything, as at the start of an episode."""
+        self.before, self.transitions = None, []  # before: the last state and action, to be set by whoever acts
+        self.disturbance, self.mismatch = np.zeros((2, len(self.plant.X_LOW)))
+        self.shift = np.zeros(len(self.plant.PSI_NOMINAL))
+
+    def memory(self):
+        """What a prediction takes, by name."""
+        return {} if self.kind is None else {"disturbance": self.disturbance, "shift": self.shift, "mismatch": self.mismatch}
+
+    def update(self, x):
+        """Take the state (n_x,) that the last action led to."""
+        if self.kind is None or self.before is None:
+            return
+        found, difference = {}, x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
+        if hasattr(self.plant, "MISMATCH_SCALE"):
+            found["mismatch"] = np.tanh(difference / self.plant.MISMATCH_SCALE)
+        if self.kind == "disturbance":
+            found["disturbance"] = difference
+        elif self.kind == "parameters":
+            self.transitions = [*self.transitions, (*self.before, x)][-self.window :]
+            found["shift"] = self._least_squares()
+        for name, value in found.items():
+            setattr(self, name, getattr(self, name) + self.gain * (value - getattr(self, name)))
+
+    def _least_squares(self, prior=1e-5):
+        """Shift of the parameters that fits the transitions; `prior` keeps what they do not show where it was."""
+        from scipy.optimize import least_squares
+
+        x, u, x_next = (np.array(v) for v in zip(*self.transitions))  # (window, n)
+        nominal, scale = self.plant.PSI_NOMINAL, (self.plant.INIT_HIGH - self.plant.INIT_LOW) / 2
+        half = np.ptp(self.plant.SCENARIOS["mpc"], axis=0) / 2
+
+        def residuals(v):  # v: shift in half-widths of the scenario set
+            predicted = self.plant.step(x, u, np.tile(nominal + half * v, (len(x), 1)))
+            return np.append((predicted - x_next) / scale, prior * (v - self.shift / half))
+
+        return half * least_squares(residuals, np.clip(self.shift / half, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
+
+
+def load(name, observe_mismatch=False, **options):
     """The plant module `envs/NAME.py`, or what its `make(**options)` returns if it has one; options that are None are left out.
 
-    Raises ValueError, one sentence, for a plant that is not there (with the list of what is) or an option that it does not take.
+    With observe_mismatch it is wrapped as a `Mismatch`. Raises ValueError, one sentence, for a plant that is not there (with the list of
+    what is) or an option that it does not take.
     """
     if name not in names():
         raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(names())}")
@@ -80,7 +164,8 @@ def load(name, **options):
     for option in options:
         if option not in known:
             raise ValueError(f"--{option} is not an option of --env {name}")
-    return module.make(**options) if hasattr(module, "make") else module
+    plant = module.make(**options) if hasattr(module, "make") else module
+    return Mismatch(plant) if observe_mismatch else plant
 
 
 def sample_states(plant, rng, n):
@@ -186,14 +271,15 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
     """`num_envs` copies of a plant stepped in one batch, same-step autoreset: the state before a reset is `infos["final_obs"]`.
 
     With `branches` > 0, `infos["branch_states"]` (num_envs, branches, n_x) holds the next states under that many scenarios
-    drawn independently of the one that the episode follows.
+    drawn independently of the one that the episode follows. With scenario_hold="episode" the scenario is drawn once per episode.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
-                 branches=0, max_episode_steps=None, **options):  # fmt: skip
+                 branches=0, scenario_hold="step", max_episode_steps=None, **options):  # fmt: skip
         self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+        self.hold = scenario_hold == "episode"
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
         self.single_observation_space, self.single_action_space = self._single_observation_space, self._single_action_space
@@ -207,6 +293,7 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
             self.x = np.empty((self.num_envs, len(self.plant.X_LOW)))
             self.goal = np.empty((self.num_envs, len(self.plant.GOAL_INDEX)))
             self.t = np.zeros(self.num_envs, dtype=np.int64)
+            self.psi = np.empty((self.num_envs, self.scenarios.shape[1]))
             mask = np.ones(self.num_envs, dtype=bool)
         self._reset_rows(mask)
         return self._obs(self.x, self.goal), {}
@@ -216,6 +303,8 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
         self.x[mask] = sample_states(self.plant, self.np_random, n)
         self.goal[mask] = self.np_random.choice(self.plant.TRAIN_GOALS, size=n)
         self.t[mask] = 0
+        if self.hold:
+            self.psi[mask] = self._draw_scenarios(n)
 
     def _draw_scenarios(self, *shape):
         return self.scenarios[self.np_random.integers(len(self.scenarios), size=shape)]
@@ -226,7 +315,7 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
             shape = (self.num_envs, self.branches)
             x, v = (np.broadcast_to(a[:, None], (*shape, a.shape[-1])) for a in (self.x, u))
             infos["branch_states"] = self.plant.step(x, v, self._draw_scenarios(*shape))
-        infos["psi"] = self._draw_scenarios(self.num_envs)
+        infos["psi"] = self.psi.copy() if self.hold else self._draw_scenarios(self.num_envs)
         self.x = self.plant.step(self.x, u, infos["psi"])
         self.t += 1
         obs = self._obs(self.x, self.goal)
@@ -240,11 +329,13 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
 
     def get_state(self):
         """Everything that the next `step` depends on, as plain data (for checkpoints)."""
-        return {"x": self.x.tolist(), "goal": self.goal.tolist(), "t": self.t.tolist(), "rng": self.np_random.bit_generator.state}
+        state = {name: getattr(self, name).tolist() for name in ("x", "goal", "t", "psi")}
+        return state | {"rng": self.np_random.bit_generator.state}
 
     def set_state(self, state):
         """Continue from what `get_state` returned; returns the observation."""
-        self.x, self.goal, self.t = np.array(state["x"]), np.array(state["goal"]), np.array(state["t"])
+        for name in ("x", "goal", "t", "psi"):
+            setattr(self, name, np.array(state.get(name, getattr(self, name))))
         self.np_random.bit_generator.state = state["rng"]
         return self._obs(self.x, self.goal)
 

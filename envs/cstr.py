@@ -56,6 +56,7 @@ EVAL_GOAL = np.array([0.65])
 GOAL_LOW, GOAL_HIGH = np.array([0.1]), np.array([2.0])
 GOAL_REACHABLE = (np.array([0.31]), np.array([0.80]))  # at steady state, inside the box, by every scenario of the "mpc" set
 ERROR_SCALE = np.array([0.05])  # mol/l; five standard deviations of the training reward
+MISMATCH_SCALE = np.array([0.02, 0.02, 0.5, 0.5])  # mol/l, mol/l, degC, degC: what the corners of the training box do in one step
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
 MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8

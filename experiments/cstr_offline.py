@@ -148,7 +148,8 @@ def errors(cell):
         seconds = time.perf_counter() - tick
     actor = sac.Actor(**data["network"])
     actor.load_state_dict(data["actor"])
-    policy, rows = sac.Policy(cstr, actor, None, sac.Scaling(**data["scaling"]), data["goal_input"]), []
+    plant = envs.load("cstr", **data["plant_options"])
+    policy, rows = sac.Policy(plant, actor, None, sac.Scaling(**data["scaling"]), data["goal_input"]), []
     for evaluation in ("nominal", "robust"):
         ape, held_out = sac.evaluate(policy, cstr.EVAL_GOAL, starts, 0, evaluation == "robust")
         for start, (error, out) in enumerate(zip(ape, held_out)):
