@@ -95,7 +95,7 @@ class Args:
     estimate: Literal["disturbance", "parameters"] = "disturbance"
     """what --offset-free estimates: what to add to every prediction, or the uncertain parameters, on which the scenarios are centred"""
     filter_gain: float = 1.0
-    """how far an estimate follows the last transitions, 1: wholly; less where measurements are noisy"""
+    """how far the estimate, or the mismatch that a critic observes, follows the last transition, 1: wholly; less in noise"""
     spread: float | None = None
     """size of the scenario set about its centre; default: 1, the plant's, with --offset-free 0.5, since the estimate explains part of it"""
     controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
@@ -147,7 +147,7 @@ class Critic:
 
     def __init__(self, data, combine):
         options = dict(data.get("plant_options", {}))
-        self.observes_mismatch = options.pop("observe_mismatch", False)
+        self.mismatch_scale = options.pop("observe_mismatch", None)  # of a critic that observes the mismatch
         self.plant = envs.load(data["env"], **options)
         self.network, self.goal_input, self.combine = data["network"], data["goal_input"], combine
         self.slack_weight = 2.0 if data["args"].get("constraint_weight") else 1.0  # the default price in a plan that ends in this value
@@ -228,7 +228,7 @@ def export(critic):
     s, (actor, twins) = critic.scaling, layers(critic)
     n_x = len(critic.plant.X_LOW)
     x, goal, u = (ca.MX.sym(name, n) for name, n in (("x", n_x), ("goal", s["goal_center"].size), ("u", s["u_center"].size)))
-    seen = [ca.MX.sym("mismatch", n_x)] if critic.observes_mismatch else []
+    seen = [ca.MX.sym("mismatch", n_x)] if critic.mismatch_scale else []
     z = critic.features(ca.vertcat(x, *seen), goal, ca)
     mu = ca.Function("mu", [x, goal, *seen], [ca.tanh(mlp(actor, z)) * s["u_scale"] + s["u_center"]])
     q = [mlp(twin, ca.vertcat(z, (u - s["u_center"]) / s["u_scale"])) for twin in twins]
@@ -333,7 +333,7 @@ def check_export(critic, V, points=64, tolerance=1e-8):
     plant, rng = critic.plant, np.random.default_rng(0)
     x = torch.tensor(envs.sample_states(plant, rng, points), requires_grad=True)
     goal = torch.tensor(rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW))))
-    seen = [torch.tensor(rng.uniform(-1, 1, size=x.shape))] if critic.observes_mismatch else []
+    seen = [torch.tensor(rng.uniform(-1, 1, size=x.shape))] if critic.mismatch_scale else []
     value, x_scale = critic.value(torch.cat([x, *seen], dim=1), goal), critic.scaling["x_scale"][: x.shape[1]]
     (gradient,) = torch.autograd.grad(value.sum(), x)
     gradient = gradient.numpy() * x_scale  # per unit of the network's input, as the value is
@@ -823,12 +823,13 @@ def build_controller(name, args):
     compile = args.compile and not hasattr(plant, "next_state")
     mu, Q, V = export(critic)
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
-    observed = "mismatch" if critic.observes_mismatch else None
-    estimator = envs.Estimator(plant, args.estimate if args.offset_free else observed, args.filter_gain)
+    observed = "mismatch" if critic.mismatch_scale else None
+    estimators = [envs.Estimator(plant, kind, args.filter_gain, critic.mismatch_scale)
+                  for kind in (observed, args.estimate if args.offset_free else observed)]  # fmt: skip
     if name == "actor":
-        return ActorController(plant, mu, goal, estimator)
+        return ActorController(plant, mu, goal, estimators[0])
     if greedy:
-        return GreedyController(plant, mu, Q, goal, estimator)
+        return GreedyController(plant, mu, Q, goal, estimators[0])
     spread = (0.5 if args.offset_free else 1.0) if args.spread is None else args.spread
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
     squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
@@ -836,10 +837,10 @@ def build_controller(name, args):
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        learned, expansion = {}, None if critic.observes_mismatch else Expansion(critic)
+        learned, expansion = {}, None if critic.mismatch_scale else Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
             V = V if compile or expansion is None else with_derivatives(V, expansion)
-            seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if critic.observes_mismatch else []
+            seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if critic.mismatch_scale else []
             learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g, *seen], [-V(x, g, *seen)]))
         elif name == "rl_mpc":
             point = settled_state(plant, mu, goal) if args.value == "taylor" else None
@@ -848,7 +849,7 @@ def build_controller(name, args):
         barrier = "adaptive" if learned else 1e-4
         slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
         mpc = ScenarioMPC(plant, args.horizon, scenarios, stage, goal=goal, robust_horizon=args.robust_horizon, compile=compile,
-                          barrier=barrier, slack_price=slack_weight if args.constraints == "soft" else np.inf, estimator=estimator,
+                          barrier=barrier, slack_price=slack_weight if args.constraints == "soft" else np.inf, estimator=estimators[1],
                           **learned)  # fmt: skip
         mpc.expansion = expansion
         return mpc
@@ -856,7 +857,7 @@ def build_controller(name, args):
     price = benchmark["slack_price"] * (len(scenarios) if robust else 1)  # the reference sums slack over scenarios
     return ScenarioMPC(plant, benchmark["horizon"], scenarios, ca.Function("stage", [x, g], [squared_error]), goal=goal,
                        robust_horizon=int(robust), slack_price=price, relaxed_price=1e3, change_weight=benchmark["change_weight"],
-                       compile=compile, estimator=estimator)  # fmt: skip
+                       compile=compile, estimator=estimators[1])  # fmt: skip
 
 
 def settled_state(plant, mu, goal, steps=1000):
@@ -1050,7 +1051,11 @@ def check(args):
         critic = load_critic(critic_path(args), args.env, args.combine)
     except ValueError as error:
         fail(f"--critic {error}")
-    if critic.observes_mismatch and args.value != "exact":
+    if args.estimate != Args.estimate and not args.offset_free:
+        fail(f"--estimate {args.estimate} has no effect without --offset-free")
+    if args.offset_free and args.estimate == "parameters" and not (np.ptp(critic.plant.SCENARIOS["mpc"], axis=0) > 0).any():
+        fail(f"--estimate is parameters, but {args.env} has none that are uncertain; choose disturbance")
+    if critic.mismatch_scale and args.value != "exact":
         fail(f"--value is {args.value}; a critic that observes the mismatch needs exact")
     plant = critic.plant
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))

@@ -60,12 +60,12 @@ class Args:
     num_envs: int | None = None
     """plants simulated in parallel; default: the plant's (cstr: 32, linear: 64)"""
     scenarios: Literal["robust", "nominal", "mpc"] = "robust"
-    """where psi is drawn from at every step: the training grid, the nominal plant, or the MPC's scenario set"""
+    """where psi is drawn from: the training grid, the nominal plant, or the MPC's scenario set"""
     scenario_hold: Literal["step", "episode"] = "step"
     """how long a scenario lasts: drawn anew at every step, as in the paper, or once per episode"""
     observe_mismatch: bool = False
-    """let the agent see how the last transition differed from the nominal model, which tells what plant it is on (with
-    --scenario-hold episode)"""
+    """let the agent see how the last transition differed from the nominal model, which tells what plant it is on; with --scenario-hold
+    episode, and a discount of at most 0.95 by default"""
     branches: int = 1
     """K, next states per transition whose targets are averaged; 1 is the paper's sampling: the one that the episode follows"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -131,19 +131,16 @@ class Args:
         """Arguments left out take the plant's value."""
         if self.env in envs.names():
             defaults = DEFAULTS | envs.load(self.env).TRAINING
-            for name, value in (defaults | ({"gamma": min(defaults["gamma"], 0.95)} if self.observe_mismatch else {})).items():
+            if self.observe_mismatch:
+                defaults["gamma"] = min(defaults["gamma"], 0.95)
+            for name, value in defaults.items():
                 if getattr(self, name) is None:
                     setattr(self, name, value)
 
     @property
     def plant_options(self):
         """What `envs.load` needs beside the plant's name."""
-        return plant_options(vars(self))
-
-
-def plant_options(args):
-    """What `envs.load` needs beside the plant's name, of arguments as a dictionary."""
-    return {name: args[name] for name in ("dim", "system", "observe_mismatch") if args[name] is not None and args[name] is not False}
+        return {name: getattr(self, name) for name in ("dim", "system", "observe_mismatch") if getattr(self, name) not in (None, False)}
 
 
 # Networks. They see normalised inputs; `Scaling` is the only place where physical units are left and entered.
@@ -485,10 +482,13 @@ def plain(args):
 
 def checkpoint(agent, args, step):
     """What deployment needs, as plain data (loads with weights_only=True)."""
+    options = {name: args[name] for name in ("dim", "system") if args[name] is not None}
+    if args["observe_mismatch"]:
+        options["observe_mismatch"] = agent.plant.MISMATCH_SCALE.tolist()
     return {
         "format": "rlmpc-sac-her-branching-1",
         "env": args["env"],
-        "plant_options": plant_options(args),
+        "plant_options": options,
         "env_id": agent.plant.ENV_ID,
         "network": agent.network,
         "goal_input": args["goal_input"],
@@ -540,8 +540,12 @@ def check(args):
     size = len(plant.X_LOW) * (2 + (args.branches if args.branches > 1 else 0)) + len(plant.U_LOW) + len(plant.GOAL_INDEX) + 4
     if args.buffer_size > 10**10 // (4 * size):
         fail(f"--buffer-size is {args.buffer_size}; at most {10**10 // (4 * size)} transitions are allowed, ten gigabytes")
+    if args.scenario_hold == "episode" and args.branches > 1:
+        fail(f"--branches is {args.branches}; --scenario-hold episode needs 1, since a branch is drawn anew at every step")
     if args.observe_mismatch and args.branches > 1:
         fail(f"--branches is {args.branches}; --observe-mismatch needs 1, since the average over plants is not that of the plant it sees")
+    if args.observe_mismatch and args.add_plant_data:
+        fail("--add-plant-data does not go with --observe-mismatch, which its states lack")
     if args.add_plant_data and args.branches > 1:
         fail(f"--branches is {args.branches}; --add-plant-data needs 1, since a plant gives one next state per action")
     if args.device == "cuda" and not torch.cuda.is_available():

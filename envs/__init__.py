@@ -74,13 +74,15 @@ class Mismatch:
 
         m_t = tanh((x_t - f(x_{t-1}, u_{t-1}, psi nominal)) / MISMATCH_SCALE)
 
-    One state does not tell which plant it comes from; one transition does. Everything but the state is the plant's.
+    One state does not tell which plant it comes from; one transition does. Everything but the state is the plant's. scale: in place of the
+    plant's MISMATCH_SCALE, (n_x,).
     """
 
-    def __init__(self, plant):
+    def __init__(self, plant, scale=None):
         if not hasattr(plant, "MISMATCH_SCALE"):
             raise ValueError(f"--observe-mismatch: {plant.ENV_ID} has no MISMATCH_SCALE")
         self.plant, n = plant, len(plant.X_LOW)
+        self.MISMATCH_SCALE = plant.MISMATCH_SCALE if scale is None else np.array(scale)
         extra = {"X_LOW": -np.inf, "X_HIGH": np.inf, "INIT_LOW": 0.0, "INIT_HIGH": 0.0, "OBS_LOW": -1.0, "OBS_HIGH": 1.0}
         for name, value in extra.items():
             setattr(self, name, np.append(getattr(plant, name), np.full(n, value)))
@@ -91,7 +93,7 @@ class Mismatch:
     def step(self, x, u, psi):
         x = np.asarray(x)[..., : len(self.plant.X_LOW)]
         x_next, nominal = self.plant.step(x, u, psi), self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi)))
-        return np.concatenate([x_next, np.tanh((x_next - nominal) / self.plant.MISMATCH_SCALE)], axis=-1)
+        return np.concatenate([x_next, np.tanh((x_next - nominal) / self.MISMATCH_SCALE)], axis=-1)
 
 
 class Estimator:
@@ -103,19 +105,27 @@ class Estimator:
     "mismatch": neither, only what an agent that observes the `Mismatch` sees (which the others tell too).
     None: nothing.
 
-    Attributes: disturbance (n_x,) and shift (n_psi,) = psi - nominal, physical units; mismatch (n_x,), zero where the plant has no
-    MISMATCH_SCALE. Each follows what the last transitions say by `gain`.
+    Attributes: disturbance (n_x,) and shift (n_psi,) = psi - nominal, physical units; mismatch (n_x,). Each follows what the last
+    transitions say by `gain`. scale: of the mismatch, (n_x,), the agent's; without it the mismatch is zero.
     """
 
-    def __init__(self, plant, kind=None, gain=1.0, window=5):
-        self.plant, self.kind, self.gain, self.window = plant, kind, gain, window
+    def __init__(self, plant, kind=None, gain=1.0, scale=None, window=5):
+        self.plant, self.kind, self.gain, self.scale, self.window = plant, kind, gain, np.inf if scale is None else np.array(scale), window
         self.reset()
 
     def reset(self):
         """Forget everything, as at the start of an episode."""
         self.before, self.transitions = None, []  # before: the last state and action, to be set by whoever acts
-        self.disturbance, self.mismatch = np.zeros((2, len(self.plant.X_LOW)))
+        self.difference = np.zeros(len(self.plant.X_LOW))
         self.shift = np.zeros(len(self.plant.PSI_NOMINAL))
+
+    @property
+    def disturbance(self):
+        return self.difference * (self.kind == "disturbance")
+
+    @property
+    def mismatch(self):
+        return np.tanh(self.difference / self.scale)
 
     def memory(self):
         """What a prediction takes, by name."""
@@ -125,16 +135,11 @@ class Estimator:
         """Take the state (n_x,) that the last action led to."""
         if self.kind is None or self.before is None:
             return
-        found, difference = {}, x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
-        if hasattr(self.plant, "MISMATCH_SCALE"):
-            found["mismatch"] = np.tanh(difference / self.plant.MISMATCH_SCALE)
-        if self.kind == "disturbance":
-            found["disturbance"] = difference
-        elif self.kind == "parameters":
+        found = x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
+        self.difference = self.difference + self.gain * (found - self.difference)
+        if self.kind == "parameters":
             self.transitions = [*self.transitions, (*self.before, x)][-self.window :]
-            found["shift"] = self._least_squares()
-        for name, value in found.items():
-            setattr(self, name, getattr(self, name) + self.gain * (value - getattr(self, name)))
+            self.shift = self.shift + self.gain * (self._least_squares() - self.shift)
 
     def _least_squares(self, prior=1e-5):
         """Shift of the parameters that fits the transitions; `prior` keeps what they do not show where it was."""
@@ -154,8 +159,8 @@ class Estimator:
 def load(name, observe_mismatch=False, **options):
     """The plant module `envs/NAME.py`, or what its `make(**options)` returns if it has one; options that are None are left out.
 
-    With observe_mismatch it is wrapped as a `Mismatch`. Raises ValueError, one sentence, for a plant that is not there (with the list of
-    what is) or an option that it does not take.
+    With observe_mismatch, True or its scale (n_x,), it is wrapped as a `Mismatch`. Raises ValueError, one sentence, for a plant that is not
+    there (with the list of what is) or an option that it does not take.
     """
     if name not in names():
         raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(names())}")
@@ -165,11 +170,14 @@ def load(name, observe_mismatch=False, **options):
         if option not in known:
             raise ValueError(f"--{option} is not an option of --env {name}")
     plant = module.make(**options) if hasattr(module, "make") else module
-    return Mismatch(plant) if observe_mismatch else plant
+    return Mismatch(plant, None if observe_mismatch is True else observe_mismatch) if observe_mismatch else plant
 
 
 def sample_states(plant, rng, n):
     """Initial states uniform in their box, (n, n_x)."""
+    if isinstance(plant, Mismatch):  # zero at first, and no random numbers of its own
+        x = sample_states(plant.plant, rng, n)
+        return np.hstack([x, np.zeros_like(x)])
     return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH, size=(n, len(plant.INIT_LOW)))
 
 
@@ -255,6 +263,8 @@ class GoalEnv(_PlantSpaces, gym.Env):
         options = options or {}
         state = options.get("state", sample_states(self.plant, self.np_random, 1)[0])
         goal = options.get("goal", self.np_random.choice(self.plant.TRAIN_GOALS))
+        if isinstance(self.plant, Mismatch):  # none yet
+            state = np.append(state[: len(self.plant.MISMATCH_SCALE)], 0 * self.plant.MISMATCH_SCALE)
         self.x, self.goal = np.array(state, dtype=np.float64), np.array(goal, dtype=np.float64)
         self.psi = options.get("psi")
         return self._obs(self.x, self.goal), {}
@@ -293,7 +303,7 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
             self.x = np.empty((self.num_envs, len(self.plant.X_LOW)))
             self.goal = np.empty((self.num_envs, len(self.plant.GOAL_INDEX)))
             self.t = np.zeros(self.num_envs, dtype=np.int64)
-            self.psi = np.empty((self.num_envs, self.scenarios.shape[1]))
+            self.psi = np.zeros((self.num_envs, self.scenarios.shape[1]))
             mask = np.ones(self.num_envs, dtype=bool)
         self._reset_rows(mask)
         return self._obs(self.x, self.goal), {}

@@ -69,7 +69,7 @@ SETTINGS = {  # of RL+MPC, on a fixed plant alone
 }
 CHANGING = [label for label in CONTROLLERS if not label.startswith("robust MPC") or "tuned" in label]
 NOISY = ["RL, offset-free", "RL+MPC", "RL+MPC, offset-free", "RL+MPC, parameters"]
-NOISES, GAINS = (0.002, 0.01), (1.0, 0.3, 0.1)
+NOISES, GAINS = (0.0, 0.002, 0.01), (1.0, 0.3, 0.1)
 
 
 @dataclass
@@ -238,9 +238,9 @@ def plot_loops(rows, paths, path):
     axes[1].legend(frameon=False, fontsize=7, loc="lower right")
     for label in NOISY:
         for gain, dashes, marker in zip(GAINS, ("-", "--", ":"), "osd"):
-            levels = [(0.0, offsets("fixed", label))] + [(noise, offsets("noise", label, str(noise), str(gain))) for noise in NOISES]
+            levels = [(noise, offsets("noise", label, str(noise), str(gain))) for noise in NOISES]
             levels = [(100 * noise, np.median(found)) for noise, found in levels if len(found)]
-            if len(levels) > 1:
+            if levels:
                 text = label if label == "RL+MPC" else f"{label}, gain {gain:g}"
                 axes[2].plot(*zip(*levels), color=CONTROLLERS[label][0], ls=dashes, marker=marker, ms=4, label=text)
     axes[2].set(xlabel="measurement noise [% of each state's range]", ylabel="offset of the true $c_B$ [%], median", yscale="log",

@@ -13,7 +13,7 @@ import rl_mpc_deploy as deploy
 class PrintedMPC(deploy.ScenarioMPC):
     """eq:QMPC as printed: stage cost and soft constraints at x_0 ... x_{N-1}, so that nothing bounds the last state but its value."""
 
-    def node_cost(self, t, x, goal, slack_cost):
+    def node_cost(self, t, x, goal, slack_cost, mismatch=None):
         n = x.shape[1]
         if t < self.horizon:
             return ca.sum2(slack_cost + self.stage_cost.map(n)(x, goal)) / n
@@ -34,7 +34,7 @@ class LiteralMPC(PrintedMPC):
     With N = 1 every term of the terminal cost sees the state under the first scenario, as in do-mpc (read in its source, 4.6.5 to 5.1.2).
     """
 
-    def node_cost(self, t, x, goal, slack_cost):
+    def node_cost(self, t, x, goal, slack_cost, mismatch=None):
         n = x.shape[1]
         if t == self.horizon == 1:
             return self.terminal_cost(x[:, 0], goal[:, 0])
