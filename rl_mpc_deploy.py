@@ -14,6 +14,7 @@ start state and plant, with the actor alone and with nominal and robust MPC.
     python rl_mpc_deploy.py --horizon 5                                            # with the critic that the repository ships
     python rl_mpc_deploy.py --critic experiments/pretrained/cstr_robust.pt         # as in the paper: a critic blind to constraints
     python rl_mpc_deploy.py --horizon 5 --critic runs/NAME/checkpoint.pt           # with your own
+    python rl_mpc_deploy.py --offset-free                                          # an estimate of the plant takes the steady-state offset
     python rl_mpc_deploy.py --horizon 0 --episodes 20 --goal 0.7 --jobs 2          # no prediction: the critic's best action
 
 It writes `runs/{env}__rl_mpc_deploy__{seed}__{time}/`: results.csv (a row per controller and episode), trajectories.npz and

@@ -14,6 +14,7 @@ HER (eq:relabeled) replaces the goal of most samples by something that the same 
 
     python sac_her_branching.py --env cstr                        # the robust agent of the paper's Example 3
     python sac_her_branching.py --env cstr --scenarios nominal    # the nominal agent it is compared with
+    python sac_her_branching.py --observe-mismatch --scenario-hold episode    # an agent that tells its plant from the last transition
     python sac_her_branching.py --resume runs/NAME/resume.pt      # continue an interrupted run, to the same numbers
 
 It writes `runs/{env}__sac_her_branching__{seed}__{time}/`: tensorboard events, evaluations.csv, checkpoint.pt (what
