@@ -65,8 +65,8 @@ class Args:
     scenario_hold: Literal["step", "episode"] = "step"
     """how long a scenario lasts: drawn anew at every step, as in the paper, or once per episode"""
     observe_mismatch: bool = False
-    """let the agent see how the last transition differed from the nominal model, which tells what plant it is on; with --scenario-hold
-    episode, and a discount of at most 0.95 by default"""
+    """let the agent see how the last transition differed from the nominal model, which tells what plant it is on; give --scenario-hold
+    episode too. Lowers the default of --gamma to 0.95"""
     branches: int = 1
     """K, next states per transition whose targets are averaged; 1 is the paper's sampling: the one that the episode follows"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -141,7 +141,8 @@ class Args:
     @property
     def plant_options(self):
         """What `envs.load` needs beside the plant's name."""
-        return {name: getattr(self, name) for name in ("dim", "system", "observe_mismatch") if getattr(self, name) not in (None, False)}
+        options = {"dim": self.dim, "system": self.system, "observe_mismatch": self.observe_mismatch or None}
+        return {name: value for name, value in options.items() if value is not None}
 
 
 # Networks. They see normalised inputs; `Scaling` is the only place where physical units are left and entered.
@@ -243,7 +244,7 @@ class Policy:
 
     def _features(self, x, goal, mismatch=None):
         x = np.atleast_2d(x)
-        if x.shape[1] < len(self.plant.X_LOW):  # of an agent that observes the mismatch
+        if isinstance(self.plant, envs.Mismatch) and x.shape[1] == len(self.plant.MISMATCH_SCALE):
             x = np.hstack([x, np.zeros_like(x) if mismatch is None else np.broadcast_to(mismatch, x.shape)])
         x = torch.as_tensor(x, dtype=torch.float32, device=self.scaling.x_center.device)
         goal = torch.as_tensor(np.atleast_2d(goal), dtype=torch.float32, device=x.device).expand(len(x), -1)
