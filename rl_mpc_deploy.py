@@ -52,6 +52,8 @@ from tqdm import tqdm
 
 import envs
 
+# arguments that results.csv has columns for, or that change no result
+ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "steps", "jobs", "controllers", "compile", "out"}
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
@@ -646,7 +648,7 @@ class ScenarioMPC:
     def set_initial_guess(self, x0):
         """Forget the previous plan: the next solve starts from `cold_guess`."""
         envs.checked_state(self.plant, x0)
-        self.plan, self.plan_left, self.last = None, 0, None
+        self.plan, self.plan_left, self.last, self.estimator.before = None, 0, None, None
 
     def _parameters(self, x0, price):
         price = np.where(np.isinf(price), 0.0, price).ravel()
@@ -817,7 +819,9 @@ class GreedyController(ActorController):
 
 
 def build_controller(name, args):
-    """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc" or "rl_mpc"."""
+    """One of the compared controllers: "actor", "nominal_mpc", "robust_mpc", "goal_mpc" or "rl_mpc". Raises ValueError for another name."""
+    if name not in LABELS:
+        raise ValueError(f"{name!r} is not a controller; choose one of {', '.join(LABELS)}")
     greedy = name == "rl_mpc" and args.horizon == 0
     critic = load_critic(critic_path(args), args.env, "min" if greedy else args.combine)
     plant = critic.plant
@@ -881,7 +885,7 @@ def critic_path(args):
 
 
 def draws(plant, episodes, seed):
-    """Start states (episodes, n_x) uniform in the constraint box and plants (episodes, n_psi) from the evaluation set."""
+    """Start states (episodes, n_x) uniform in their box and plants (episodes, n_psi) from the evaluation set."""
     rngs = [np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)]  # episode i does not depend on how many there are
     return np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs]), np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
 
@@ -932,7 +936,8 @@ def run_job(name, args, episode):
     x, u, row = run_episode(controller, controller.plant, starts[episode], psi[episode], controller.goal, args.steps)
     head = {"env": args.env, "controller": name, "horizon": getattr(controller, "horizon", 0),
             "critic": f"{critic.absolute().parent.name}/{critic.name}", "goal": " ".join(f"{g:g}" for g in controller.goal),
-            "episode": episode, "seed": args.seed, "psi": json.dumps(psi[episode].tolist())}  # fmt: skip
+            "episode": episode, "seed": args.seed, "psi": json.dumps(psi[episode].tolist()),
+            "arguments": json.dumps({k: v for k, v in vars(args).items() if k not in ELSEWHERE and v != getattr(Args, k)})}  # fmt: skip
     return name, episode, x, u, head | {k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}
 
 
@@ -979,8 +984,10 @@ def table(rows):
     ]
     for name in dict.fromkeys(row["controller"] for row in rows):
         mine = [row for row in rows if row["controller"] == name]
-        near, outside, offset, median, p95 = (np.array([row[key] for row in mine]) for key in list(mine[0])[8:13])
-        failed, *rungs = (sum(row[key] for row in mine) for key in list(mine[0])[13:])
+        measures = ("time_near_goal", "time_outside_constraints", "ape_tail", "solve_ms_median", "solve_ms_p95")
+        near, outside, offset, median, p95 = (np.array([row[key] for row in mine]) for key in measures)
+        counts = ("solver_failures", "retries", "fallback_plan", "fallback_actor")
+        failed, *rungs = (sum(row[key] for row in mine) for key in counts)
         lines.append(
             f"{label(mine[0]):22s}  {np.median(near):6.1f} [{near.min():5.1f}]  {np.median(outside):6.1f} [{outside.min():5.1f}]  "
             f"{np.median(offset):6.2f}  {np.median(median):6.1f}  {np.median(p95):7.1f}  {failed:7d}" + "".join(f"{n:7d}" for n in rungs)
@@ -1001,12 +1008,12 @@ def figure(plant, args, rows, paths, goal, path, episode=0):
     if len(shown) > 12:  # of a large plant, the first few
         shown = [i for i in shown if i < 4 or len(plant.X_LOW) <= i < len(plant.X_LOW) + 2]
     fig, axes = plt.subplots(-(-len(shown) // 3), 3, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
-    hours, names = np.arange(args.steps + 1) * plant.DT, {row["controller"]: label(row) for row in rows}
+    times, names = np.arange(args.steps + 1) * plant.DT, {row["controller"]: label(row) for row in rows}
     for i, ax in zip(shown, axes.ravel()):
         for name, (x, u) in paths.items():
             values = np.hstack([x[episode], np.vstack([u[episode], u[episode][-1:]])])[:, i]
             (colour, dashes), style = STYLES[name], "default" if i < len(plant.X_LOW) else "steps-post"
-            ax.plot(hours, values, color=colour, ls=dashes, lw=1.8, drawstyle=style, label=names[name])
+            ax.plot(times, values, color=colour, ls=dashes, lw=1.8, drawstyle=style, label=names[name])
         for bound in (low[i], high[i]):
             if np.isfinite(bound):
                 ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
@@ -1052,8 +1059,14 @@ def check(args):
         critic = load_critic(critic_path(args), args.env, args.combine)
     except ValueError as error:
         fail(f"--critic {error}")
-    if args.estimate != Args.estimate and not args.offset_free:
-        fail(f"--estimate {args.estimate} has no effect without --offset-free")
+    unused = {
+        "estimate": (not args.offset_free, "without --offset-free"),
+        "filter_gain": (not args.offset_free and not critic.mismatch_scale, "without --offset-free"),
+        "slack_weight": (args.constraints == "hard", "on hard constraints"),
+    }
+    for name, (is_unused, why) in unused.items():
+        if is_unused and getattr(args, name) != getattr(Args, name):
+            fail(f"--{name.replace('_', '-')} {getattr(args, name)} has no effect {why}")
     if args.offset_free and args.estimate == "parameters" and not (np.ptp(critic.plant.SCENARIOS["mpc"], axis=0) > 0).any():
         fail(f"--estimate is parameters, but {args.env} has none that are uncertain; choose disturbance")
     if critic.mismatch_scale and args.value != "exact":

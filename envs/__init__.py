@@ -99,8 +99,8 @@ class Mismatch:
 class Estimator:
     """What the last transitions tell about a plant, for predictions without steady-state offset. Of the kinds
 
-    "disturbance": what one transition adds to the nominal model, x_t - f(x_{t-1}, u_{t-1}, nominal), which every prediction then adds:
-        the classic construction (Pannocchia and Rawlings, AIChE Journal 49(2), 2003), here with the whole state measured.
+    "disturbance": what one transition adds to the nominal model, x_t - f(x_{t-1}, u_{t-1}, nominal), which every prediction then adds: the
+        classic construction (Pannocchia and Rawlings, AIChE Journal 49(2), 2003), here with the whole state measured.
     "parameters": psi by least squares over the last `window` transitions, within twice the box of the MPC's scenarios.
     "mismatch": neither, only what an agent that observes the `Mismatch` sees (which the others tell too).
     None: nothing.
@@ -148,12 +148,13 @@ class Estimator:
         x, u, x_next = (np.array(v) for v in zip(*self.transitions))  # (window, n)
         nominal, scale = self.plant.PSI_NOMINAL, (self.plant.INIT_HIGH - self.plant.INIT_LOW) / 2
         half = np.ptp(self.plant.SCENARIOS["mpc"], axis=0) / 2
+        known = np.where(half > 0, half, 1.0)  # what no scenario varies stays nominal
 
         def residuals(v):  # v: shift in half-widths of the scenario set
             predicted = self.plant.step(x, u, np.tile(nominal + half * v, (len(x), 1)))
-            return np.append((predicted - x_next) / scale, prior * (v - self.shift / half))
+            return np.append((predicted - x_next) / scale, prior * (v - self.shift / known))
 
-        return half * least_squares(residuals, np.clip(self.shift / half, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
+        return half * least_squares(residuals, np.clip(self.shift / known, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
 
 
 def load(name, observe_mismatch=False, **options):

@@ -334,7 +334,7 @@ def test_horizon_zero_maximises_the_critic(checkpoint):
         assert best >= float(Q(x0, mu(x0, GOAL), GOAL)) - 1e-9
 
 
-COLUMNS = ("env controller horizon critic goal episode seed psi time_near_goal time_outside_constraints ape_tail solve_ms_median "
+COLUMNS = ("env controller horizon critic goal episode seed psi arguments time_near_goal time_outside_constraints ape_tail solve_ms_median "
            "solve_ms_p95 solver_failures retries fallback_plan fallback_actor").split()  # fmt: skip
 
 
@@ -348,8 +348,8 @@ def test_command_line_end_to_end_and_any_number_of_jobs(checkpoint, tmp_path):
         assert {p.name for p in (tmp_path / str(jobs)).iterdir()} == {"results.csv", "trajectories.npz", "episode.png"}
         rows = list(csv.DictReader(open(tmp_path / str(jobs) / "results.csv")))
         assert list(rows[0]) == COLUMNS and len(rows) == 9
-        assert len(json.loads(rows[0]["psi"])) == 2
-        assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[8:])
+        assert len(json.loads(rows[0]["psi"])) == 2 and json.loads(rows[0]["arguments"]) == {}
+        assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[9:])
         tables.append([{k: v for k, v in row.items() if not k.startswith("solve_ms")} for row in rows])
     assert tables[0] == tables[1]
     trajectories = np.load(tmp_path / "1" / "trajectories.npz")

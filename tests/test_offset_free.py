@@ -230,6 +230,8 @@ def test_command_lines(observing, tmp_path):
         ("sac_her_branching.py", ["--observe-mismatch", "--add-plant-data", "x.npz"], ["--add-plant-data", "--observe-mismatch"]),
         ("rl_mpc_deploy.py", ["--offset-free", "--filter-gain", "0"], ["--filter-gain", "0.0"]),
         ("rl_mpc_deploy.py", ["--estimate", "parameters"], ["--estimate", "no effect", "--offset-free"]),
+        ("rl_mpc_deploy.py", ["--filter-gain", "0.5"], ["--filter-gain", "no effect", "--offset-free"]),
+        ("rl_mpc_deploy.py", ["--constraints", "hard", "--slack-weight", "3"], ["--slack-weight", "no effect", "hard"]),
         ("rl_mpc_deploy.py", ["--env", "linear", "--offset-free", "--estimate", "parameters"], ["--estimate", "uncertain"]),
         ("rl_mpc_deploy.py", ["--value", "taylor", "--critic", "{}"], ["--value", "mismatch"]),
     ],
