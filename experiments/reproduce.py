@@ -54,11 +54,12 @@ def training(name, *arguments, minutes=1.0):
     return Step(f"critic_{name}", ("sac_her_branching.py", *arguments), minutes)
 
 
-CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained")
+CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
 STEPS = [
     training("cstr_robust", "--env", "cstr"),
     training("cstr_nominal", "--env", "cstr", "--scenarios", "nominal"),
     training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
+    training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
     training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
     experiment("dip_equilibria", minutes=2),
     experiment("linear_scalability", "main", 15),
@@ -68,6 +69,8 @@ STEPS = [
     experiment("cstr_training", minutes=25),
     experiment("cstr_offline", minutes=15),
     experiment("cstr_offline", "ablation", 40),
+    experiment("cstr_offset_free", "training", 40, ["cstr_offline"]),
+    experiment("cstr_offset_free", "loops", 60, CRITICS),
     experiment("cstr_tune", minutes=40, needs=CRITICS),
     experiment("cstr_profile", minutes=1, needs=CRITICS),
     experiment("cstr_deploy", minutes=95, needs=CRITICS),
@@ -137,7 +140,9 @@ def run(step, args):
     else:
         command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
         command += [] if script in ONE_AT_A_TIME else ["--jobs", "1"]
-        shared = "cstr_loops" if script.startswith("cstr_") and script not in ("cstr_offline", "cstr_training") else script
+        shared = (
+            "cstr_loops" if script.startswith("cstr_") and script not in ("cstr_offline", "cstr_training", "cstr_offset_free") else script
+        )
         command += [] if script in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
     if result.returncode:
