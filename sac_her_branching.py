@@ -81,9 +81,9 @@ class Args:
     smooth_reward: bool = True
     """Gaussian reward (eq:cstrreward); off: the 0/1 reward (eq:sparsereward)"""
     reward_sigma2: float | None = None
-    """sigma^2 of the Gaussian reward, squared units of the goal; default: the plant's (cstr: 1e-4)"""
+    """sigma^2 of the Gaussian reward, squared units of the goal error; default: the plant's (cstr: 1e-4)"""
     reward_tolerance: float | None = None
-    """half-width of the 0/1 reward, units of the goal; default: the plant's (cstr: 0.01)"""
+    """half-width of the 0/1 reward, units of the goal error; default: the plant's (cstr: 0.01)"""
     constraint_weight: float = 0.0
     """weight of the measure of time outside constraints, exp(-|x - clip(x)|^2 / 0.02) - 1, in the reward; 0: the paper's agent"""
     goal_input: Literal["error", "goal"] = "error"
@@ -113,7 +113,7 @@ class Args:
     buffer_size: int | None = None
     """transitions that the replay buffer holds; default: the plant's (cstr: 200000)"""
     target_entropy: float | None = None
-    """entropy that the coefficient alpha is tuned to; default: the plant's (cstr: minus the number of actions)"""
+    """entropy that the coefficient alpha is tuned to; default: minus the number of actions"""
     alpha_init: float | None = None
     """entropy coefficient at the start; default: the plant's (cstr: 1, linear: 0.005)"""
 
@@ -266,8 +266,10 @@ class Policy:
 
 
 def load_policy(path, device="cpu"):
-    """The agent stored in a checkpoint.pt."""
+    """The agent stored in a checkpoint.pt. Raises ValueError for data of another kind."""
     data = torch.load(path, map_location=device, weights_only=True)
+    if data.get("format") != "rlmpc-sac-her-branching-1":
+        raise ValueError(f"{path} is not a checkpoint.pt of this script")
     plant = envs.load(data["env"], **data.get("plant_options", {}))
     actor, critic = Actor(**data["network"]).to(device), TwinCritic(**data["network"]).to(device)
     actor.load_state_dict(data["actor"])
@@ -282,7 +284,7 @@ class HERBuffer:
     """Ring buffer of the parallel plants' transitions, episode after episode; goals are replaced when a batch is drawn.
 
     Row t % rows holds time t of every plant. Example with `future`: an episode covers t = 100 ... 149 and the sample is
-    t = 120; the hindsight goal is what x_{t'+1} achieved for t' uniform in 120 ... 149, so that at least one t' is rewarded.
+    t = 120; the hindsight goal is what x_{t'+1} achieved for t' uniform in 120 ... 149, with t' = 120 among them, whose reward is full.
     """
 
     OPEN = 2**62  # end of an episode that is still running
@@ -594,14 +596,14 @@ def main(args):
     plant = check(args)
     plant_data = load_plant_data(args.add_plant_data, plant) if args.add_plant_data and not state else None
     run_dir = run_dir or args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
-    try:
-        run_dir.mkdir(parents=True, exist_ok=state is not None)
-        writer = SummaryWriter(run_dir, purge_step=state["step"] if state else None)
-    except OSError as error:
-        fail(f"--out {args.out}: cannot write {run_dir} there ({error.strerror})")
     device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
     if state and state["device"] != device.type:
         fail(f"--resume {run_dir / 'resume.pt'} was written on {state['device']}; its random state cannot continue on {device.type}")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=state is not None)
+        writer = SummaryWriter(run_dir, purge_step=state["step"] + 1 if state else None)
+    except OSError as error:
+        fail(f"{'--resume' if state else '--out'}: cannot write {run_dir} ({error.strerror})")
     torch.set_num_threads(args.torch_threads)
     plain_args = plain(args)
     writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in plain_args.items()))

@@ -290,6 +290,8 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
     def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
                  branches=0, scenario_hold="step", max_episode_steps=None, **options):  # fmt: skip
         self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+        if scenario_hold not in ("step", "episode"):
+            raise ValueError(f"scenario_hold={scenario_hold!r} is neither 'step' nor 'episode'")
         self.hold = scenario_hold == "episode"
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
