@@ -267,9 +267,13 @@ def plot_training(rows, path):
             ax.plot(found, np.full(len(found), -position), marker, color=colour, ms=4, alpha=0.5)
             ax.plot([cells.iqm(found)[0]] * 2, [-position - 0.3, -position + 0.3], color=colour, lw=2.5)
     ax.set_yticks(-np.arange(len(labels)), labels)
-    ax.set(
-        xscale="log", xlabel="absolute percentage error of $c_B$, robust evaluation, of 200 starts: median (blue), 75th percentile (red)"
-    )
+    ax.set(xscale="log", xlabel="absolute percentage error of $c_B$ on uncertain plants, 200 starts")
+    ax.set_xticks([0.2, 0.3, 0.5, 1, 2, 3, 5], ["0.2", "0.3", "0.5", "1", "2", "3", "5"])
+    ax.minorticks_off()
+    styles = {"median over starts": ("#0072B2", "o"), "75th percentile": ("#D55E00", "d")}
+    handles = [plt.Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in styles.items()]
+    title = "points: training seeds; bars: interquartile means"
+    fig.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False, fontsize=9, title=title, title_fontsize=9)
     ax.grid(axis="x", alpha=0.3)
     fig.savefig(path, dpi=150)
 

@@ -51,7 +51,7 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_tune", None, ["cstr_tune"], []),
     ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
     ("cstr_offline", "ablation", [], []),
-    ("cstr_offset_free", "training", [], []),
+    ("cstr_offset_free", "training", ["cstr_offset_free_training"], ["cstr_offset_free_training"]),
     ("cstr_offset_free", None, [], []),
 ]
 NO_RUNS = {"cstr_profile", "dip_equilibria", "solve_time"}  # too short to be kept in parts
