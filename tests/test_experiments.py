@@ -45,7 +45,7 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_deploy", "expansion", ["cstr_expansion"], ["cstr_expansion"]),
     ("cstr_oracle", None, ["cstr_oracle", "cstr_oracle_gap"], []),
     ("cstr_frontier", None, ["cstr_frontier"], ["cstr_frontier"]),
-    ("cstr_ablation", None, [], []),
+    ("cstr_ablation", None, ["cstr_ablation"], ["cstr_ablation"]),
     ("cstr_shift", None, ["cstr_shift"], ["cstr_shift"]),
     ("cstr_shift", "critic", ["cstr_shift_critic"], ["cstr_shift_critic"]),
     ("cstr_tune", None, ["cstr_tune"], []),
