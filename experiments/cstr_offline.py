@@ -218,10 +218,12 @@ def plot_ablation(rows, path):
             ax.plot([low, high], [-position, -position], color="#0072B2", lw=2)
             ax.plot(values, np.full(len(values), -position), "o", color="#999999", ms=4)
             ax.plot(middle, -position, "D", color="#0072B2", ms=6)
-            ax.set(xlabel="median absolute percentage error of $c_B$", title=f"{evaluation} evaluation", xlim=(0, None))
+            ax.set(xlabel="median absolute percentage error of $c_B$", title=f"{evaluation} evaluation")
             ax.grid(axis="x", alpha=0.3)
             texts += f"{line(values):42s}"
         print(f"{texts}{np.median([float(row['train_seconds']) for row in rows if row['agent'] == label]):7.0f}")
+    for ax in axes:
+        ax.set_xlim(0, None)
     axes[0].set_yticks(-np.arange(len(labels)), labels)
     fig.suptitle("interquartile mean, its 95 % bootstrap interval, every training seed", fontsize=10)
     fig.savefig(path, dpi=150)

@@ -50,7 +50,7 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_shift", "critic", ["cstr_shift_critic"], ["cstr_shift_critic"]),
     ("cstr_tune", None, ["cstr_tune"], []),
     ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
-    ("cstr_offline", "ablation", [], []),
+    ("cstr_offline", "ablation", ["cstr_offline_ablation"], ["cstr_offline_ablation"]),
     ("cstr_offset_free", "training", ["cstr_offset_free_training"], ["cstr_offset_free_training"]),
     ("cstr_offset_free", None, [], []),
 ]
