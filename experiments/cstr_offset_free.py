@@ -242,8 +242,10 @@ def plot_loops(rows, paths, path):
             levels = [(100 * noise, np.median(found)) for noise, found in levels if len(found)]
             if levels:
                 text = label if label == "RL+MPC" else f"{label}, gain {gain:g}"
-                axes[2].plot(*zip(*levels), color=CONTROLLERS[label][0], ls=dashes, marker=marker, ms=4, label=text)
-    axes[2].set(xlabel="measurement noise [% of each state's range]", ylabel="offset of the true $c_B$ [%], median", yscale="log",
+                axes[2].plot(
+                    *zip(*levels), color="black" if label == "RL+MPC" else CONTROLLERS[label][0], ls=dashes, marker=marker, ms=4, label=text
+                )
+    axes[2].set(xlabel="measurement noise [% of range]", ylabel="offset of the true $c_B$ [%], median", yscale="log",
                 title="noise and the filter gain")  # fmt: skip
     if axes[2].lines:
         axes[2].legend(frameon=False, fontsize=7)

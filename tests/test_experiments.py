@@ -52,12 +52,12 @@ REACTOR = [  # script, study, tables, figures; in this order
     ("cstr_offline", None, ["cstr_offline"], ["cstr_offline"]),
     ("cstr_offline", "ablation", ["cstr_offline_ablation"], ["cstr_offline_ablation"]),
     ("cstr_offset_free", "training", ["cstr_offset_free_training"], ["cstr_offset_free_training"]),
-    ("cstr_offset_free", None, [], []),
+    ("cstr_offset_free", None, ["cstr_offset_free", "cstr_offset_free_profile"], ["cstr_offset_free"]),
 ]
 NO_RUNS = {"cstr_profile", "dip_equilibria", "solve_time"}  # too short to be kept in parts
 TEXT = {
     "case",
-    "c_B",
+    "c_B",  # a path, as text
     "env",
     "variant",
     "agent",
