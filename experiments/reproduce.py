@@ -1,8 +1,8 @@
 """Every CSV and figure of the repository, from nothing: trains the critics, then runs every experiment.
 
     python experiments/reproduce.py --list                         # what there is, and what is done
-    python experiments/reproduce.py --quick --out /tmp/quick       # all of it on tiny budgets, in a few minutes
-    python experiments/reproduce.py                                # all of it: most of a day on two cores; continues where it stopped
+    python experiments/reproduce.py --quick --out runs/quick       # all of it on tiny budgets
+    python experiments/reproduce.py                                # all of it, for hours (--list estimates); continues where it stopped
     python experiments/reproduce.py --only cstr_deploy             # one step, after what it needs
     python experiments/reproduce.py --backend dask --scheduler tcp://HOST:8786    # on a cluster whose workers share this folder
 
