@@ -440,8 +440,8 @@ class ScenarioMPC:
     relaxed_price: if given, an unsuccessful solve is repeated with every bound soft at this price.
     change_weight: (n_u,), price of the squared change of each action, summed over scenarios.
     actor: CasADi function (x, goal) -> u that supplies cold guesses and the last rung of the failure ladder, or None.
-    taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: the state (n_x,) to expand at, or
-    None for where each scenario's guess ends.
+    taylor: a TaylorValue whose expansion is the terminal cost, instead of terminal_cost. expand_at: a function goal -> state (n_x,) to
+    expand at, or None for where each scenario's guess ends.
     estimator: an `envs.Estimator`, whose disturbance predictions add and whose shift of the parameters centres the scenarios; default:
     of the kind that estimates nothing. terminal_cost and actor may take its mismatch, (n_x,), as a third argument.
     barrier: IPOPT's barrier parameter at the start of a warm solve, or "adaptive" (mu_strategy, of every solve). A smaller one saves
@@ -450,15 +450,13 @@ class ScenarioMPC:
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=1, slack_price=1.0,
                  relaxed_price=None, change_weight=None, actor=None, taylor=None, expand_at=None, estimator=None, barrier=1e-4,
-                 tol=1e-6, compile=True):  # fmt: skip
+                 tol=1e-6, max_iter=200, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         self.plant, self.horizon, self.robust_horizon, self.actor = plant, horizon, robust_horizon, actor
         self.scenarios = np.asarray(scenarios if robust_horizon else scenarios[:1])
         self.stage_cost, self.terminal_cost, self.taylor, self.expand_at = stage_cost, terminal_cost, taylor, expand_at
-        self.goal = np.array(goal, dtype=float)
-        if self.goal.shape != (len(plant.GOAL_INDEX),):
-            raise ValueError(f"goal has shape {self.goal.shape}; {plant.ENV_ID} needs ({len(plant.GOAL_INDEX)},)")
+        self.goal = envs.checked_goal(plant, goal)
         self.n_x, self.n_u = len(plant.X_LOW), len(plant.U_LOW)
         self.slack_price = np.broadcast_to(np.asarray(slack_price, dtype=float), (2, self.n_x))
         self.relaxed_price, self.barrier = relaxed_price, barrier
@@ -468,11 +466,10 @@ class ScenarioMPC:
         self.u_center, self.u_scale = (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2
         self._build_tree()
         self.theta = np.empty((0, self.nodes[-1])) if taylor is None else taylor.parameters(np.zeros((self.n_x, self.nodes[-1])))
-        if expand_at is not None:
-            self.theta[:] = taylor.parameters(np.asarray(expand_at)[:, None])
         self.estimator = estimator or envs.Estimator(plant)
         self._build_problem()
-        self._build_solvers(compile, tol)
+        self._build_solvers(compile, tol, max_iter)
+        self.set_goal(goal)
         self.reset()
 
     def _build_tree(self):
@@ -567,10 +564,10 @@ class ScenarioMPC:
             x_next = substep(x_next, u, psi)
         return ca.Function("step", [x, u, psi], [x_next], {"never_inline": True})
 
-    def _build_solvers(self, compile, tol):
+    def _build_solvers(self, compile, tol, max_iter):
         """IPOPT twice on the same functions: from scratch, and from a nearby solution with its multipliers."""
         # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost
-        common = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 200, "bound_relax_factor": 0.0}
+        common = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": max_iter, "bound_relax_factor": 0.0}
         # variables are scaled already: MUMPS need not, nor refine every solution (a tenth of the time)
         common |= {"mumps_permuting_scaling": 0, "mumps_scaling": 0, "min_refinement_steps": 0}
         warm = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
@@ -604,6 +601,14 @@ class ScenarioMPC:
         self.last_w = None
         self.stats = {}
         self.estimator.reset()
+
+    def set_goal(self, goal):
+        """The goal from now on, (n_goal,). Raises ValueError for one of another shape or with an entry that is not finite."""
+        self.goal, self.last = envs.checked_goal(self.plant, goal), None
+        if self.taylor is not None:
+            self.taylor.goal = self.goal
+            if self.expand_at is not None:
+                self.theta[:] = self.taylor.parameters(self.expand_at(self.goal)[:, None])
 
     def block(self, w, name, t):
         """A view (rows, nodes) of the variables or constraints `name` of stage t in a vector like w or g, scaled units."""
@@ -690,7 +695,7 @@ class ScenarioMPC:
         stats = solver.stats()
         self.stats["status"] = stats["return_status"]
         self.stats["iterations"] += stats["iter_count"]
-        if not stats["success"]:
+        if not stats["success"] or not np.isfinite(self.last_objective):
             return None
         return tuple(np.array(result[key]).ravel() for key in ("x", "lam_x", "lam_g"))
 
@@ -700,8 +705,8 @@ class ScenarioMPC:
         Ladder: a solve, from the previous plan shifted by one sampling time (where the state moves slowly also unshifted) or from the
         actor's rollout, whichever costs less; if it does not succeed, one more from a cold guess that was not tried yet (with relaxed
         bounds, if relaxed_price is given; after a step that needed them they are tried first, and the hard bounds if no slack is
-        left); then the next action of the last successful plan, while it lasts; then the actor, or without one the last action.
-        `stats` says which.
+        left); then the next action of the last successful plan, while it lasts; then the actor ("actor"); without one, or where its action
+        is not finite, the last action ("hold"). `stats` says which.
         """
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.stats = {"success": True, "rung": "solved", "status": "", "iterations": 0}
@@ -737,15 +742,17 @@ class ScenarioMPC:
         self.last, self.x_before = solution, x0
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
-        elif self.plan_left > 0:
+        elif self.plan_left > 0 and np.isfinite(self.plan[0]).all():
             self.stats["rung"], solution = "plan", self.plan
         if solution is not None:
             u = self.physical(solution[0], "u", 0)[:, 0]
             self.plan = solution[0][self.shift_w], solution[1][self.shift_w], solution[2][self.shift_g]
             self.plan_left -= 1
         else:
-            self.stats["rung"], self.plan = "actor", None
+            self.stats["rung"], self.plan = "actor" if self.actor is not None else "hold", None
             u = self.policy(x0).ravel() if self.actor is not None else self.u_before
+        if not np.isfinite(u).all():  # of networks far from where they were trained
+            self.stats["rung"], u = "hold", self.u_before
         self.u_before = np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
         self.estimator.before = x0, self.u_before
         self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
@@ -763,12 +770,16 @@ class ActorController:
     """The learned policy alone, with the interface of ScenarioMPC."""
 
     def __init__(self, plant, actor, goal, estimator=None):
-        self.plant, self.actor, self.goal, self.estimator = plant, actor, np.array(goal, dtype=float), estimator or envs.Estimator(plant)
+        self.plant, self.actor, self.estimator = plant, actor, estimator or envs.Estimator(plant)
+        self.set_goal(goal)
         self.reset()
 
     def reset(self):
-        self.stats = {}
+        self.stats, self.u_before = {}, np.zeros(len(self.plant.U_LOW))
         self.estimator.reset()
+
+    def set_goal(self, goal):
+        self.goal = envs.checked_goal(self.plant, goal)
 
     def set_initial_guess(self, x0):
         """Nothing to guess."""
@@ -776,11 +787,12 @@ class ActorController:
     def make_step(self, x0):
         x0, tick = envs.checked_state(self.plant, x0), time.perf_counter()
         self.estimator.update(x0)
-        seen = [self.estimator.mismatch] if self.actor.n_in() == 3 else []
-        u = np.clip(self.act(x0, *seen), self.plant.U_LOW, self.plant.U_HIGH)
-        self.estimator.before = x0, u
-        self.stats = {"success": True, "rung": "solved", "wall_ms": 1e3 * (time.perf_counter() - tick)}
-        return u
+        u = self.act(x0, *([self.estimator.mismatch] if self.actor.n_in() == 3 else []))
+        success = bool(np.isfinite(u).all())  # not so far from where networks were trained; then the last action stays
+        self.u_before = np.clip(u if success else self.u_before, self.plant.U_LOW, self.plant.U_HIGH)
+        self.estimator.before = x0, self.u_before
+        self.stats = {"success": success, "rung": "solved" if success else "hold", "wall_ms": 1e3 * (time.perf_counter() - tick)}
+        return self.u_before.copy()
 
     def act(self, x0, *seen):
         """The action before it is clipped, (n_u,); seen: the mismatch (n_x,), if the networks take it."""
@@ -795,10 +807,11 @@ class GreedyController(ActorController):
 
     def __init__(self, plant, actor, Q, goal, estimator=None, points=9):
         super().__init__(plant, actor, goal, estimator)
-        x, v = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("v", len(plant.U_LOW))  # v: action scaled to [0, 1]
+        sizes = (("x", len(plant.X_LOW)), ("v", len(plant.U_LOW)), ("goal", len(self.goal)))
+        x, v, g = (ca.MX.sym(name, n) for name, n in sizes)  # v: action scaled to [0, 1]
         seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if actor.n_in() == 3 else []
-        q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), self.goal, *seen)
-        self.negative_q = ca.Function("negative_q", [v, x, *seen], [-q, -ca.gradient(q, v)])
+        q = Q(x, plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), g, *seen)
+        self.negative_q = ca.Function("negative_q", [v, x, g, *seen], [-q, -ca.gradient(q, v)])
         if v.numel() <= 2:
             self.points = np.stack([a.ravel() for a in np.meshgrid(*[np.linspace(0, 1, points)] * v.numel())])  # (n_u, points^n_u)
         else:
@@ -806,11 +819,11 @@ class GreedyController(ActorController):
 
     def act(self, x0, *seen):
         span = self.plant.U_HIGH - self.plant.U_LOW
-        at_points = np.array(self.negative_q(self.points, x0, *seen)[0]).ravel()
+        at_points = np.array(self.negative_q(self.points, x0, self.goal, *seen)[0]).ravel()
         starts = [(super().act(x0, *seen) - self.plant.U_LOW) / span, self.points[:, at_points.argmin()]]
 
         def objective(v):
-            value, gradient = self.negative_q(v, x0, *seen)
+            value, gradient = self.negative_q(v, x0, self.goal, *seen)
             return float(value), np.array(gradient).ravel()
 
         results = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[(0, 1)] * len(span)) for start in starts]
@@ -848,7 +861,7 @@ def build_controller(name, args):
             seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if critic.mismatch_scale else []
             learned = dict(actor=mu, terminal_cost=ca.Function("terminal", [x, g, *seen], [-V(x, g, *seen)]))
         elif name == "rl_mpc":
-            point = settled_state(plant, mu, goal) if args.value == "taylor" else None
+            point = (lambda goal: settled_state(plant, mu, goal)) if args.value == "taylor" else None
             learned = dict(actor=mu, taylor=TaylorValue(V, expansion, goal, critic.scaling["x_scale"]), expand_at=point)
         # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
         barrier = "adaptive" if learned else 1e-4
@@ -912,7 +925,7 @@ def run_episode(controller, plant, x0, psi, goal, steps):
         "solver_failures": sum(not s["success"] for s in log),
         "retries": rungs.count("retry"),
         "fallback_plan": rungs.count("plan"),
-        "fallback_actor": rungs.count("actor"),
+        "fallback_actor": rungs.count("actor") + rungs.count("hold"),
     }
     return x, u, row
 

@@ -136,6 +136,8 @@ class Estimator:
         if self.kind is None or self.before is None:
             return
         found = x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
+        if not np.isfinite(found).all():  # from where the model overflows nothing is learnt
+            return
         self.difference = self.difference + self.gain * (found - self.difference)
         if self.kind == "parameters":
             self.transitions = [*self.transitions, (*self.before, x)][-self.window :]
@@ -213,6 +215,14 @@ def checked_state(plant, x0):
     if not np.isfinite(x0).all():
         raise ValueError(f"state is {x0}; every entry must be finite")
     return x0
+
+
+def checked_goal(plant, goal):
+    """The goal as a float array (n_goal,). Raises ValueError if it has another shape or an entry that is not finite."""
+    goal = np.array(goal, dtype=float)
+    if goal.shape != (len(plant.GOAL_INDEX),) or not np.isfinite(goal).all():
+        raise ValueError(f"goal is {goal}; {plant.ENV_ID} needs ({len(plant.GOAL_INDEX)},) finite numbers")
+    return goal
 
 
 class _PlantSpaces:

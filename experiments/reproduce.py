@@ -1,7 +1,7 @@
 """Every CSV and figure of the repository, from nothing: trains the critics, then runs every experiment.
 
     python experiments/reproduce.py --list                         # what there is, and what is done
-    python experiments/reproduce.py --quick --out runs/quick       # all of it on tiny budgets
+    python experiments/reproduce.py --quick                        # all of it on tiny budgets, in minutes, into runs/quick
     python experiments/reproduce.py                                # all of it, for hours (--list estimates); continues where it stopped
     python experiments/reproduce.py --only cstr_deploy             # one step, after what it needs
     python experiments/reproduce.py --backend dask --scheduler tcp://HOST:8786    # on a cluster whose workers share this folder
@@ -98,7 +98,7 @@ NOTHING_KEPT = {"dip_equilibria", "cstr_profile", "solve_time"}  # take no --run
 @dataclass
 class Args:
     quick: bool = False
-    """tiny budgets: a smoke test of everything; name an --out of its own, or it replaces the committed results"""
+    """tiny budgets: a smoke test of everything"""
     only: tuple[str, ...] = ()
     """steps to run, with what they need; default: all"""
     list: bool = False
@@ -111,9 +111,9 @@ class Args:
     """address of the dask scheduler"""
     runs: Path = ROOT / "runs/reproduce"
     """where finished parts are kept; on a cluster a folder that every worker sees"""
-    out: Path = HERE
-    """folder whose results/, figures/ and pretrained/ are written; experiments read the shipped critics, so that only the default trains
-    those that it then uses"""
+    out: Path | None = None
+    """folder whose results/, figures/ and pretrained/ are written; default: experiments/, with --quick runs/quick. Experiments read the
+    shipped critics, so that only experiments/ trains those that it then uses"""
 
 
 def version(quick):
@@ -192,6 +192,7 @@ def main(args, steps=STEPS):
         cells.fail(f"--jobs is {args.jobs}; it must lie in 1 to 1024")
     if (args.backend == "dask") != bool(args.scheduler):
         cells.fail("--backend dask and --scheduler ADDRESS belong together")
+    args.out = args.out or (ROOT / "runs/quick" if args.quick else HERE)
     if args.quick and args.out.resolve() == HERE:
         cells.fail("--quick would replace the committed results by those of tiny budgets; name another folder with --out")
     args.runs, args.out = args.runs.absolute(), args.out.absolute()

@@ -270,7 +270,7 @@ def test_every_status_is_read(checkpoint):
     assert controller.stats["status"] == "Maximum_Iterations_Exceeded" and not controller.stats["success"]
     with pytest.raises(ValueError, match="no prediction"):
         controller.prediction()
-    assert controller.stats["rung"] == "actor" and ((cstr.U_LOW <= u) & (u <= cstr.U_HIGH)).all()
+    assert controller.stats["rung"] == "hold" and ((cstr.U_LOW <= u) & (u <= cstr.U_HIGH)).all()
 
 
 def test_infeasible_benchmark_is_solved_with_relaxed_bounds_and_counted():

@@ -317,7 +317,7 @@ def test_taylor_model_of_a_quadratic_critic_is_exact_and_its_controllers_are_equ
     xs, g = ca.MX.sym("x", 4), ca.MX.sym("goal", 4)
     stage, minus_v = ca.Function("s", [xs, g], [-ca.exp(-ca.sumsqr(xs))]), ca.Function("t", [xs, g], [-V(xs, g)])
     actions = []
-    for learned in (dict(terminal_cost=minus_v), dict(taylor=taylor, expand_at=np.zeros(4)), dict(taylor=taylor)):
+    for learned in (dict(terminal_cost=minus_v), dict(taylor=taylor, expand_at=lambda goal: np.zeros(4)), dict(taylor=taylor)):
         mpc = deploy.ScenarioMPC(plant, 3, plant.SCENARIOS["mpc"], stage, goal=np.zeros(4), compile=False, tol=1e-9, **learned)
         state = np.array([0.9, -0.5, 0.7, -0.9])
         for _ in range(3):
