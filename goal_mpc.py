@@ -163,7 +163,7 @@ class ScenarioMPC:
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, *, goal, robust_horizon=0, discretization="rk4",
                  slack_price=1.0, slack_price_l2=0.0, change_weight=None, gamma=1.0, law=None, control_horizon=None, solver="ipopt",
-                 guide=None, tol=1e-6, compile=True):  # fmt: skip
+                 guide=None, tol=1e-6, max_iter=500, compile=True):  # fmt: skip
         if horizon < 1:
             raise ValueError(f"horizon is {horizon}; it must be at least 1")
         if control_horizon is not None and control_horizon < horizon and law is None:
@@ -187,7 +187,7 @@ class ScenarioMPC:
         self._build_tree()
         self._build_layout()
         self._build_problem()
-        self._build_solvers(compile, tol)
+        self._build_solvers(compile, tol, max_iter)
         self.set_goal(goal)
         self.reset()
 
@@ -335,9 +335,9 @@ class ScenarioMPC:
         residual = ca.vec((slopes - dt * field) / self.x_scale)
         return ca.Function("collocation", [xs, us, psis, inside], [points[:, -1], residual], {"never_inline": True})
 
-    def _build_solvers(self, compile, tol):
+    def _build_solvers(self, compile, tol, max_iter):
         """The solver twice on the same functions: from scratch, and (IPOPT) from a nearby solution with its multipliers."""
-        cold = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": 500, "bound_relax_factor": 0.0}
+        cold = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": max_iter, "bound_relax_factor": 0.0}
         warm = cold | {"warm_start_init_point": "yes", "mu_init": 1e-7, "warm_start_bound_push": 1e-6, "warm_start_mult_bound_push": 1e-6,
                        "warm_start_slack_bound_push": 1e-6, "warm_start_bound_frac": 1e-6, "warm_start_slack_bound_frac": 1e-6}  # fmt: skip
 
@@ -346,7 +346,7 @@ class ScenarioMPC:
             if self.solver == "ipopt":
                 return common | {"ipopt": warm if name == "warm" else cold}
             structure = {"structure_detection": "auto", "equality": (self.bounds["ubg"] == 0).tolist()}
-            return common | structure | {"fatrop": {"print_level": 0, "tol": tol, "max_iter": 500}}
+            return common | structure | {"fatrop": {"print_level": 0, "tol": tol, "max_iter": max_iter}}
 
         self.solvers = compiled_solver(self.solver, self.nlp, options) if compile else None
         self.compiled = self.solvers is not None
@@ -464,7 +464,7 @@ class ScenarioMPC:
             solution = self._solve("cold", x0, other(x0))
         if solution is not None:
             self.last_w, self.plan_left = solution[0], self.horizon
-        elif self.plan_left > 0:
+        elif self.plan_left > 0 and np.isfinite(self.plan[0]).all():
             self.stats["rung"], solution = "plan", self.plan
         if solution is not None:
             self.u_before = np.clip(self.physical(solution[0], "u", 0)[:, 0], self.plant.U_LOW, self.plant.U_HIGH)
@@ -472,6 +472,7 @@ class ScenarioMPC:
             self.plan_left -= 1
         else:
             self.stats["rung"], self.plan = "hold", None
+            self.u_before = np.clip(self.u_before, self.plant.U_LOW, self.plant.U_HIGH)
         self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
         return self.u_before.copy()
 

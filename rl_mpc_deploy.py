@@ -35,6 +35,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
@@ -54,6 +55,7 @@ import envs
 
 # arguments that results.csv has columns for, or that change no result
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "steps", "jobs", "controllers", "compile", "out"}
+MAX_CHECKPOINT_BYTES = 10**9
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
@@ -154,9 +156,11 @@ class Critic:
         self.plant = envs.load(data["env"], **options)
         self.network, self.goal_input, self.combine = data["network"], data["goal_input"], combine
         self.slack_weight = 2.0 if data["args"].get("constraint_weight") else 1.0  # the default price in a plan that ends in this value
-        self.actor, self.critic = Actor(**self.network).double(), TwinCritic(**self.network).double()
-        self.actor.load_state_dict(data["actor"])
-        self.critic.load_state_dict(data["critic"])
+        with torch.device("meta"):  # sizes take no memory until the file's own weights are put in, if they fit
+            self.actor, self.critic = Actor(**self.network), TwinCritic(**self.network)
+        self.actor.load_state_dict(data["actor"], assign=True)
+        self.critic.load_state_dict(data["critic"], assign=True)
+        self.actor, self.critic = self.actor.double(), self.critic.double()
         # affine maps between physical and network units
         self.scaling = {k: np.array(v, dtype=int if k.endswith("index") else float) for k, v in data["scaling"].items()}
 
@@ -175,6 +179,11 @@ class Critic:
         angles = concat([x, goal])[s["angle_index"], :]
         return concat([concat([(x - s["x_center"]) / s["x_scale"], g])[s["other_index"], :], xp.sin(angles), xp.cos(angles)])
 
+    def example(self):
+        """A network input in physical units: the plant's start state, below it a mismatch of zero if that is observed, and a goal."""
+        start = np.asarray(self.plant.START, dtype=float)
+        return np.append(start, np.zeros_like(start)) if self.mismatch_scale else start, np.asarray(self.plant.EVAL_GOAL, dtype=float)
+
     def value(self, x, goal):
         """V(x, g) = Q(x, mu(x, g), g) in torch, (B, n_x) and (B, n_goal) -> (B,)."""
         z = self.features(x.T, goal.T, torch).T
@@ -183,22 +192,34 @@ class Critic:
 
 
 def load_critic(path, env, combine="first"):
-    """The actor and critic stored in a checkpoint.pt. Raises ValueError, one sentence, for anything else."""
+    """The actor and critic stored in a checkpoint.pt, which is data, never code. Raises ValueError, one sentence, for anything else."""
+    path, found = Path(path), None
     try:
+        if path.stat().st_size > MAX_CHECKPOINT_BYTES:
+            raise ValueError(f"larger than {MAX_CHECKPOINT_BYTES / 1e9:g} gigabytes")
+        if zipfile.ZipFile(path).testzip():
+            raise ValueError("damaged")
         data = torch.load(path, map_location="cpu", weights_only=True)
         if data["format"] != "rlmpc-sac-her-branching-1":
-            raise KeyError
-        if data["env"] != env:
-            raise ValueError(f"{path} was trained on {data['env']!r}, not on {env!r}; --env and --critic must match")
-        critic = Critic(data, combine)
+            raise ValueError("of another format")
+        found = data["env"]
+        if found == env:
+            critic = Critic(data, combine)
+            if critic.goal_input not in ("error", "goal"):
+                raise ValueError(f"unknown goal_input {critic.goal_input!r}")
+            if not all(p.isfinite().all() for p in [*critic.actor.parameters(), *critic.critic.parameters()]):
+                raise ValueError("weights that are not finite")
+            if not all((v > 0).all() for name, v in critic.scaling.items() if name.endswith("scale")):
+                raise ValueError("scales that are not positive")
+            if not critic.value(*(torch.from_numpy(v)[None] for v in critic.example())).isfinite().all():
+                raise ValueError("values that are not finite")
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist; it must be a checkpoint.pt written by sac_her_branching.py") from None
-    except ValueError:
-        raise
     except Exception as error:  # text, a truncated file, a folder, a pickle of code, weights that do not fit: torch raises many types
-        raise ValueError(f"{path} is not a checkpoint.pt of sac_her_branching.py ({type(error).__name__})") from None
-    if not all(p.isfinite().all() for p in [*critic.actor.parameters(), *critic.critic.parameters()]):
-        raise ValueError(f"{path} has weights that are not finite")
+        reason = str(error) if type(error) is ValueError and "\n" not in str(error) else type(error).__name__
+        raise ValueError(f"{path} is not a checkpoint.pt of sac_her_branching.py ({reason})") from None
+    if found != env:
+        raise ValueError(f"{path} was trained on {found!r}, not on {env!r}; --env and --critic must match")
     return critic
 
 
@@ -1008,6 +1029,15 @@ def table(rows):
     return "\n".join(lines)
 
 
+def write_csv(rows, path):
+    """Rows of equal keys as a table; a killed process leaves no half of it."""
+    with open(path.with_suffix(".tmp"), "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    path.with_suffix(".tmp").replace(path)
+
+
 def figure(plant, args, rows, paths, goal, path, episode=0):
     """Trajectories of one episode: a panel per state and action, with bounds and goal."""
     import matplotlib
@@ -1114,10 +1144,7 @@ def main(args):
         print("building the controllers; new ones are compiled, which takes half a minute", flush=True)
     tick = time.perf_counter()
     rows, paths = compare(args)
-    with open(out / "results.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(rows, out / "results.csv")
     np.savez_compressed(out / "trajectories.npz", **{f"{name}_{k}": v for name, xu in paths.items() for k, v in zip("xu", xu)})
     figure(plant, args, rows, paths, goal, out / "episode.png")
     print(table(rows))

@@ -26,6 +26,7 @@ import os
 import signal
 import sys
 import time
+import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -44,6 +45,9 @@ import envs
 # of the arguments that a plant's TRAINING may set
 DEFAULTS = {"hidden": (64, 64), "total_timesteps": 100_000, "num_envs": 32, "gamma": 0.99, "steps_per_update": 8, "learning_starts": 1_000,
             "buffer_size": 200_000, "alpha_init": 1.0}  # fmt: skip
+
+
+MAX_CHECKPOINT_BYTES = 10**9
 
 
 @dataclass
@@ -266,15 +270,36 @@ class Policy:
 
 
 def load_policy(path, device="cpu"):
-    """The agent stored in a checkpoint.pt. Raises ValueError for data of another kind."""
-    data = torch.load(path, map_location=device, weights_only=True)
-    if data.get("format") != "rlmpc-sac-her-branching-1":
-        raise ValueError(f"{path} is not a checkpoint.pt of this script")
-    plant = envs.load(data["env"], **data.get("plant_options", {}))
-    actor, critic = Actor(**data["network"]).to(device), TwinCritic(**data["network"]).to(device)
-    actor.load_state_dict(data["actor"])
-    critic.load_state_dict(data["critic"])
-    return Policy(plant, actor, critic, Scaling(device, **data["scaling"]), data["goal_input"])
+    """The agent stored in a checkpoint.pt, which is data, never code. Raises ValueError, one sentence, for anything else."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_CHECKPOINT_BYTES:
+            raise ValueError(f"larger than {MAX_CHECKPOINT_BYTES / 1e9:g} gigabytes")
+        if zipfile.ZipFile(path).testzip():
+            raise ValueError("damaged")
+        data = torch.load(path, map_location=device, weights_only=True)
+        if data["format"] != "rlmpc-sac-her-branching-1":
+            raise ValueError("of another format")
+        if data["goal_input"] not in ("error", "goal"):
+            raise ValueError(f"unknown goal_input {data['goal_input']!r}")
+        plant = envs.load(data["env"], **data.get("plant_options", {}))
+        with torch.device("meta"):  # sizes take no memory until the file's own weights are put in, if they fit
+            actor, critic = Actor(**data["network"]), TwinCritic(**data["network"])
+        actor.load_state_dict(data["actor"], assign=True)
+        critic.load_state_dict(data["critic"], assign=True)
+        if not all(p.isfinite().all() for p in [*actor.parameters(), *critic.parameters()]):
+            raise ValueError("weights that are not finite")
+        if not all((np.asarray(v, dtype=float) > 0).all() for name, v in data["scaling"].items() if name.endswith("scale")):
+            raise ValueError("scales that are not positive")
+        policy = Policy(plant, actor.float(), critic.float(), Scaling(device, **data["scaling"]), data["goal_input"])
+        if not np.isfinite(policy.value(plant.START, plant.EVAL_GOAL)).all():
+            raise ValueError("values that are not finite")
+    except FileNotFoundError:
+        raise ValueError(f"{path} does not exist; it must be a checkpoint.pt of this script") from None
+    except Exception as error:  # text, a truncated file, a folder, a pickle of code, weights that do not fit: torch raises many types
+        reason = str(error) if type(error) is ValueError and "\n" not in str(error) else type(error).__name__
+        raise ValueError(f"{path} is not a checkpoint.pt of this script ({reason})") from None
+    return policy
 
 
 # Replay with hindsight
@@ -506,11 +531,13 @@ def checkpoint(agent, args, step):
     }
 
 
-def write_rows(rows, path):
-    with open(path, "w", newline="") as file:
+def write_csv(rows, path):
+    """Rows of equal keys as a table; a killed process leaves no half of it."""
+    with open(path.with_suffix(".tmp"), "w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
+    path.with_suffix(".tmp").replace(path)
 
 
 def fail(message):
@@ -621,12 +648,17 @@ def main(args):
         buffer.add_episodes(*plant_data, rng.choice(plant.TRAIN_GOALS, size=len(plant_data[0])))
     returns, finished, step, updates, seconds, rows = np.zeros(args.num_envs), [], 0, 0, 0.0, []
     if state:
-        agent.load_state_dict(state["agent"])
-        buffer.load_state_dict({k: v.to(device) if torch.is_tensor(v) else v for k, v in state["buffer"].items()})
-        obs = vec.set_state(state["vec"])
-        rng.bit_generator.state = state["rng"]
-        returns, finished, step, updates, seconds, rows = (state[k] for k in ("returns", "finished", "step", "updates", "seconds", "rows"))
-        returns = np.array(returns)
+        try:
+            agent.load_state_dict(state["agent"])
+            buffer.load_state_dict({k: v.to(device) if torch.is_tensor(v) else v for k, v in state["buffer"].items()})
+            obs = vec.set_state(state["vec"])
+            rng.bit_generator.state = state["rng"]
+            returns, finished, step, updates, seconds, rows = (
+                state[k] for k in ("returns", "finished", "step", "updates", "seconds", "rows")
+            )
+            returns = np.array(returns)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            fail(f"--resume {run_dir / 'resume.pt'}: its state does not fit its arguments ({type(error).__name__})")
 
     def save_all():
         save(checkpoint(agent, plain_args, step), run_dir / "checkpoint.pt")
@@ -679,7 +711,7 @@ def main(args):
                 row = evaluation_row(agent.policy, args.eval_episodes, seed=args.seed)
                 log({f"eval/{name}": value for name, value in row.items()})
                 rows.append({"step": step, "updates": updates, "train_seconds": round(seconds, 2)} | row)
-                write_rows(rows, run_dir / "evaluations.csv")
+                write_csv(rows, run_dir / "evaluations.csv")
                 bar.set_postfix_str(f"robust error {row['robust_median_ape']:.2f} %, nominal {row['nominal_median_ape']:.2f} %")
             if due(args.save_every):
                 save_all()

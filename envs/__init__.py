@@ -105,6 +105,8 @@ class Estimator:
     "mismatch": neither, only what an agent that observes the `Mismatch` sees (which the others tell too).
     None: nothing.
 
+    A transition further from the model than half the box of initial states is taken for a wrong measurement and left out.
+
     Attributes: disturbance (n_x,) and shift (n_psi,) = psi - nominal, physical units; mismatch (n_x,). Each follows what the last
     transitions say by `gain`. scale: of the mismatch, (n_x,), the agent's; without it the mismatch is zero.
     """
@@ -136,7 +138,7 @@ class Estimator:
         if self.kind is None or self.before is None:
             return
         found = x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
-        if not np.isfinite(found).all():  # from where the model overflows nothing is learnt
+        if not (np.abs(found) < (self.plant.INIT_HIGH - self.plant.INIT_LOW) / 2).all():  # a glitch of the measurement, not the plant
             return
         self.difference = self.difference + self.gain * (found - self.difference)
         if self.kind == "parameters":

@@ -82,6 +82,11 @@ STEPS = [
     experiment("cstr_ablation", minutes=100, needs=["cstr_deploy_critics"]),
     experiment("cstr_shift", "plants", 50, CRITICS),
     experiment("cstr_shift", "critic", 4, CRITICS),
+    experiment("reliability", "controllers", 20, CRITICS),
+    experiment("reliability", "training", 10),
+    experiment("reliability", "checkpoints", 2),
+    experiment("reliability", "deployments", 15, CRITICS, alone=True),
+    experiment("reliability", "determinism", 10, CRITICS, alone=True),
     experiment("dip_performance", minutes=90, alone=True),
     experiment("linear_value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
     experiment("linear_value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
@@ -105,6 +110,8 @@ class Args:
     """print the steps, what they need and whether they are done"""
     jobs: int = 2
     """steps at a time"""
+    step_jobs: int = 1
+    """processes within each step; no result depends on it"""
     backend: Literal["processes", "dask"] = "processes"
     """where steps run: processes of this machine, or the workers of a dask cluster"""
     scheduler: str = ""
@@ -139,7 +146,7 @@ def run(step, args):
         command += ["--out", str(trained), *(["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else [])]
     else:
         command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
-        command += [] if script in ONE_AT_A_TIME else ["--jobs", "1"]
+        command += [] if script in ONE_AT_A_TIME else ["--jobs", str(args.step_jobs)]
         shared = (
             "cstr_loops" if script.startswith("cstr_") and script not in ("cstr_offline", "cstr_training", "cstr_offset_free") else script
         )
@@ -188,8 +195,9 @@ def waves(steps):
 
 
 def main(args, steps=STEPS):
-    if not 1 <= args.jobs <= 1024:
-        cells.fail(f"--jobs is {args.jobs}; it must lie in 1 to 1024")
+    for name in ("jobs", "step_jobs"):
+        if not 1 <= getattr(args, name) <= 1024:
+            cells.fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in 1 to 1024")
     if (args.backend == "dask") != bool(args.scheduler):
         cells.fail("--backend dask and --scheduler ADDRESS belong together")
     args.out = args.out or (ROOT / "runs/quick" if args.quick else HERE)

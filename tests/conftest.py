@@ -1,4 +1,7 @@
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -27,3 +30,13 @@ def checkpoint(tmp_path_factory, plant):
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt"
     training.save(training.checkpoint(agent, training.plain(args), step=0), path)
     return path
+
+
+@pytest.fixture(scope="session")
+def quick(tmp_path_factory):
+    """The whole reproduction on tiny budgets: a folder with results/, figures/, pretrained/ and runs/."""
+    folder = tmp_path_factory.mktemp("quick")
+    command = [sys.executable, "experiments/reproduce.py", "--quick", "--out", folder, "--runs", folder / "runs"]
+    out = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True, timeout=1200)
+    assert out.returncode == 0, out.stderr
+    return folder

@@ -42,14 +42,6 @@ TEXT = {
 }
 
 
-@pytest.fixture(scope="session")
-def quick(tmp_path_factory):
-    """The whole reproduction on tiny budgets."""
-    folder = tmp_path_factory.mktemp("quick")
-    run("reproduce", "--quick", "--out", folder, "--runs", folder / "runs")
-    return folder
-
-
 def run(name, *arguments):
     command = [sys.executable, f"experiments/{name}.py", *map(str, arguments)]
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)

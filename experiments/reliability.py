@@ -1,0 +1,434 @@
+"""What happens when things go wrong, counted: faults in closed loops, killed trainings, hostile checkpoints, many deployments, two runs.
+
+    python experiments/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
+
+controllers: closed loops over random starts, goals and plants, and the same with a fault at every fourth step: numbers that are not
+finite in the measurement, in the previous plan and in its multipliers, states far outside the box, a solver stopped after three
+iterations, goals that cannot be reached. An action must be finite and within its limits, a measurement that is none must be refused,
+and the next step without a fault must be solved again.
+training: SIGKILL at random moments, then --resume; the end must equal an uninterrupted run, bit for bit.
+checkpoints: damaged and malicious files; each must be refused in one sentence or, where the damage is not to be seen, load as finite
+numbers.
+deployments: 2,000 in one process; memory must not grow.
+determinism: the whole reproduction on tiny budgets, twice, with one and with two processes in every step; tables must be the same but for
+times.
+
+Writes results/reliability_STUDY.csv, a row per case.
+"""
+
+import collections
+import io
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path.insert(0, str(ROOT))
+import cells
+import reproduce
+
+import goal_mpc as gm
+import rl_mpc_deploy as deploy
+import sac_her_branching as sac
+
+EPISODE = 25  # steps
+CONTROLLERS = {
+    "RL+MPC, N = 5": lambda: deploy.build_controller("rl_mpc", deploy.Args()),
+    "RL+MPC, offset-free": lambda: deploy.build_controller("rl_mpc", deploy.Args(offset_free=True)),
+    "RL+MPC, N = 0": lambda: deploy.build_controller("rl_mpc", deploy.Args(horizon=0)),
+    "RL+MPC, linear, n = 32": lambda: deploy.build_controller("rl_mpc", deploy.Args(env="linear", horizon=3)),
+    "actor": lambda: deploy.build_controller("actor", deploy.Args()),
+    "nominal MPC": lambda: deploy.build_controller("nominal_mpc", deploy.Args()),
+    "robust MPC": lambda: deploy.build_controller("robust_mpc", deploy.Args()),
+    "goal_mpc.py, reactor": lambda: gm.build_controller(gm.Args(env="cstr", horizon=10, robust_horizon=1)),
+    "goal_mpc.py, pendulum": lambda: gm.build_controller(gm.Args(horizon=20)),
+}
+PLANS = [name for name in CONTROLLERS if name not in ("actor", "RL+MPC, N = 0")]  # have a solver and a plan
+FAULTS = {  # case: controllers that it can befall
+    "random": list(CONTROLLERS),
+    "plan not finite": PLANS,
+    "multipliers not finite": PLANS,
+    "measurement not finite": list(CONTROLLERS),
+    "state far outside": list(CONTROLLERS),
+    "3 iterations": PLANS,
+    "3 iterations, always": PLANS,
+    "goal out of reach": list(CONTROLLERS),
+}
+STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 1,000
+CELL = 500  # steps
+RUNGS = ("solved", "retry", "plan", "actor", "hold")  # of the failure ladder
+TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")  # columns that may differ from run to run
+
+
+@dataclass(frozen=True)
+class Args:
+    study: Literal["controllers", "training", "checkpoints", "deployments", "determinism"] = "controllers"
+    """what to break"""
+    jobs: int = 2
+    """processes; the results do not depend on it"""
+    quick: bool = False
+    """tiny budgets: a smoke test"""
+    plot_only: bool = False
+    """print the committed table"""
+    runs: Path = Path("runs/reliability")
+    """where finished parts are kept"""
+    out: Path = HERE
+    """folder whose results/ are written"""
+
+
+# Closed loops
+
+
+def stopped_early(controller):
+    """The controller's solvers, stopped after three iterations."""
+    usual = controller.solvers
+    controller._build_solvers(controller.compiled, tol=1e-6, max_iter=3)
+    early, controller.solvers = controller.solvers, usual
+    return early
+
+
+@cache
+def built(name):
+    torch.set_num_threads(1)
+    controller = CONTROLLERS[name]()
+    return controller, stopped_early(controller) if name in PLANS else None
+
+
+def draw(plant, rng, far=False):
+    """Start state, goal (if far: out of reach) and plant parameters."""
+    psi = rng.uniform(plant.EVAL_PSI.min(axis=0), plant.EVAL_PSI.max(axis=0))
+    goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH)
+    if far:
+        goal = goal + (plant.GOAL_HIGH - plant.GOAL_LOW) * rng.uniform(2, 10, size=goal.shape) * rng.choice([-1, 1], size=goal.shape)
+    return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH), goal, psi
+
+
+def spoil(controller, case, x, rng):
+    """Bring the fault about; returns what is measured."""
+    if case == "measurement not finite":
+        return np.where(rng.uniform(size=x.shape) < 0.5, rng.choice([np.nan, np.inf, -np.inf]), x)
+    if case == "state far outside":
+        reach = 10.0 ** rng.uniform(1, 12)
+        return x + reach * rng.uniform(-1, 1, size=x.shape) * (controller.plant.INIT_HIGH - controller.plant.INIT_LOW)
+    if case in ("plan not finite", "multipliers not finite"):
+        for name in ("plan", "last"):  # each (w, multipliers of bounds, multipliers of constraints)
+            if getattr(controller, name, None) is not None:
+                parts = [part.copy() for part in getattr(controller, name)]
+                for part in parts[:1] if case.startswith("plan") else parts[1:]:
+                    part[rng.uniform(size=part.shape) < 0.1] = np.nan
+                setattr(controller, name, tuple(parts))
+    return x
+
+
+def solved(controller):
+    """Whether the last step found an optimum, if need be from a second guess or with relaxed bounds, as the benchmarks do."""
+    return int(controller.stats["rung"] in ("solved", "retry"))
+
+
+def closed_loop(cell):
+    """One case of one controller: the counts that are a row of the table."""
+    case, name, steps, seed = cell
+    controller, early = built(name)
+    plant, rng = controller.plant, np.random.default_rng([seed, *case.encode(), *name.encode()])
+    counts = collections.Counter({key: 0 for key in ("faults", "refused", "wrong", "chances", "recovered", *RUNGS)})
+    usual = getattr(controller, "solvers", None)
+    for _ in range(max(steps // EPISODE, 1)):
+        x, goal, psi = draw(plant, rng, far=case == "goal out of reach")
+        controller.reset()
+        controller.set_goal(goal)
+        controller.set_initial_guess(x)
+        faulty_before = False
+        for t in range(min(EPISODE, steps)):
+            faulty = case != "random" and t % 4 == 2 and case not in ("goal out of reach", "3 iterations, always")
+            measured = spoil(controller, case, x, rng) if faulty else x
+            if early is not None:
+                controller.solvers = early if case == "3 iterations, always" or faulty and case == "3 iterations" else usual
+            counts["faults"] += faulty or case in ("goal out of reach", "3 iterations, always")
+            try:
+                u = controller.make_step(measured)
+            except ValueError as error:
+                if np.isfinite(measured).all() or "finite" not in str(error):
+                    raise
+                counts["refused"] += 1
+                u = controller.make_step(x)  # the true state, as the next message may bring it
+                counts.update(chances=1, recovered=solved(controller))
+            else:
+                counts["wrong"] += not np.isfinite(measured).all()
+                if faulty_before:
+                    counts.update(chances=1, recovered=solved(controller))
+                faulty_before = faulty
+            counts[controller.stats["rung"]] += 1
+            counts["wrong"] += not (np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all())
+            x = plant.step(x, u, psi)
+        if case in ("goal out of reach", "3 iterations, always"):  # a last step without it
+            controller.solvers = usual
+            controller.set_goal(plant.EVAL_GOAL)
+            controller.make_step(x)
+            counts.update(chances=1, recovered=solved(controller))
+    return [{"case": case, "controller": name, "steps": sum(counts[rung] for rung in RUNGS)} | dict(counts)]
+
+
+def controllers(args):
+    rounds = []
+    for name in CONTROLLERS:  # one after the other, so that few processes build and compile the same
+        for case in (case for case in FAULTS if name in FAULTS[case]):
+            steps = 10 if args.quick else STEPS.get((case, name), 1_000)
+            rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
+    inputs = [Path(__file__), *(ROOT / "envs").glob("*.py"), Path(gm.__file__), Path(deploy.__file__)]
+    total = {}
+    for row in cells.collect(closed_loop, rounds, args.jobs, args.runs, inputs):
+        counts = total.setdefault((row["case"], row["controller"]), collections.Counter())
+        counts.update({key: int(value) for key, value in row.items() if key not in ("case", "controller")})
+    return [{"case": case, "controller": name} | dict(total[case, name]) for case in FAULTS for name in FAULTS[case]]
+
+
+# Training
+
+
+TRAINING = ["--env", "cstr", "--hidden", "16", "16", "--total-timesteps", "6400", "--learning-starts", "320", "--eval-every", "1600",
+            "--eval-episodes", "20", "--save-every", "160", "--buffer-size", "3200"]  # fmt: skip
+
+
+def train(*arguments, kill_after=None):
+    """The training script in a process of its own, killed after some seconds unless it has finished. Returns whether it finished."""
+    process = subprocess.Popen([sys.executable, "sac_her_branching.py", *map(str, arguments)], cwd=ROOT, stdout=subprocess.DEVNULL,
+                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    try:
+        _, error = process.communicate(timeout=kill_after)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        return False
+    if process.returncode:
+        raise RuntimeError(error)
+    return True
+
+
+def equal(a, b):
+    """Whether nested plain data and tensors are the same, bit for bit, but for times and folders."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a if k not in ("seconds", "train_seconds", "out"))
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(equal, a, b))
+    return torch.equal(a, b) if torch.is_tensor(a) else a == b or (a != a and b != b)
+
+
+def killed(cell):
+    """A training killed at random moments, and what is left each time; compared with one that was not."""
+    branches, kills, seed = cell
+    rng, landed, half, mid_write = np.random.default_rng(seed), 0, 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        start = [*TRAINING, "--branches", branches, "--seed", seed, "--out"]
+        tick = time.perf_counter()
+        train(*start, folder / "whole")
+        seconds = time.perf_counter() - tick
+        finished = False
+        while not finished:
+            runs = list((folder / "killed").glob("*/resume.pt"))
+            arguments = ["--resume", runs[0]] if runs else [*start, folder / "killed"]
+            finished = train(*arguments, kill_after=rng.uniform(0.2, 1) * seconds if landed < kills else None)
+            landed += not finished
+            found = [path for name in ("resume.pt", "checkpoint.pt") for path in (folder / "killed").glob(f"*/{name}")]
+            mid_write += any((folder / "killed").glob("*/*.tmp"))
+            for path in found:
+                try:
+                    torch.load(path, weights_only=True)
+                except Exception:
+                    half += 1
+            if not runs and not found:  # killed before it had saved anything
+                shutil.rmtree(folder / "killed", ignore_errors=True)
+        whole, resumed = (next((folder / name).glob("*/resume.pt")).parent for name in ("whole", "killed"))
+        same = all(
+            equal(*(torch.load(run / name, weights_only=True) for run in (whole, resumed))) for name in ("resume.pt", "checkpoint.pt")
+        )
+        same = same and without_times(whole / "evaluations.csv") == without_times(resumed / "evaluations.csv")
+    return [{"branches": branches, "kills": landed, "half": half, "mid_write": mid_write, "same": same}]
+
+
+def training(args):
+    kills = 1 if args.quick else 12
+    parts = [(branches, kills, seed) for seed in range(1 if args.quick else 2) for branches in (1, 4)]
+    inputs = [Path(__file__), *(ROOT / "envs").glob("*.py"), Path(sac.__file__)]
+    found = cells.collect(killed, parts, args.jobs, args.runs, inputs)
+    kills, half, mid_write = (sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write"))
+    same = sum(row["same"] == "True" for row in found)
+    return [result("training", "SIGKILL: what was saved is whole", kills, kills - half, f"{mid_write} of them while a file was written"),
+            result("training", "killed again and again and resumed: equal to an uninterrupted run", len(found), same)]  # fmt: skip
+
+
+def result(study, case, trials, held, detail=""):
+    return {"study": study, "case": case, "trials": trials, "held": held, "detail": detail}
+
+
+def without_times(path):
+    """A table without the columns that may differ from run to run."""
+    return [{key: value for key, value in row.items() if not TIMES.search(key)} for row in cells.read(path)]
+
+
+# Checkpoints
+
+
+class Code:
+    def __reduce__(self):
+        return print, ("code from a checkpoint was run",)
+
+
+def hostile(data, rng, tries):
+    """Pairs of a name and the bytes of a file, made from a good checkpoint."""
+
+    def stored(data):
+        file = io.BytesIO()
+        torch.save(data, file)
+        return file.getvalue()
+
+    good = stored(data)
+    yield "a pickle that runs code", stored(data | {"actor": Code()})
+    yield "a pickle that runs code", stored(Code())
+    for _ in range(tries):
+        yield "truncated", good[: rng.integers(len(good))]
+    for _ in range(tries):
+        flipped = bytearray(good)
+        for at in rng.integers(len(good), size=rng.integers(1, 9)):
+            flipped[at] ^= 1 << rng.integers(8)
+        yield "bits flipped", bytes(flipped)
+    for name in data["actor"] | data["critic"]:
+        net = "actor" if name in data["actor"] else "critic"
+        weights = data[net][name]
+        yield "wrong shapes", stored(data | {net: data[net] | {name: weights[..., :-1]}})
+        yield "wrong shapes", stored(data | {net: {k: v for k, v in data[net].items() if k != name}})
+        bad = weights.clone()
+        bad.view(-1)[rng.integers(bad.numel())] = rng.choice([np.nan, np.inf])
+        yield "weights that are not finite", stored(data | {net: data[net] | {name: bad}})
+    for hidden in ([10**9, 10**9], [64] * 10**4, [-1], ["64"], [], None, 64, [1.5]):
+        yield "networks of other sizes", stored(data | {"network": data["network"] | {"hidden": hidden}})
+    for key in data:
+        yield "entries missing or of another type", stored({k: v for k, v in data.items() if k != key})
+        for value in (None, "x", -1, [], {}, [np.nan], torch.zeros(3)):
+            value = value if not isinstance(value, list) else [float(v) for v in value]
+            yield "entries missing or of another type", stored(data | {key: value})
+    for key, value in data["scaling"].items():
+        for changed in (value[:-1], [float("nan")] * len(value), [0.0] * len(value), None, [10**6] * len(value)):
+            yield "scaling damaged", stored(data | {"scaling": data["scaling"] | {key: changed}})
+
+
+LOADERS = (sac.load_policy, lambda path: deploy.load_critic(path, "cstr"))
+
+
+def read(load, path):
+    """What a loader makes of a file, counted: refused in one sentence, loaded to finite values, or neither ("wrong")."""
+    try:
+        agent = load(path)
+    except ValueError as error:
+        return collections.Counter(["refused" if "\n" not in str(error) else "wrong"])
+    except Exception as error:
+        print(f"{path}: {type(error).__name__} {error}", file=sys.stderr)
+        return collections.Counter(["wrong"])
+    if isinstance(agent, sac.Policy):
+        value = agent.value(agent.plant.START, agent.plant.EVAL_GOAL)
+    else:
+        value = agent.value(*(torch.from_numpy(v)[None] for v in agent.example())).detach().numpy()
+    return collections.Counter(["loaded" if np.isfinite(value).all() else "wrong"])
+
+
+def checkpoints(args):
+    """Both loaders on every hostile file."""
+    data = torch.load(deploy.critic_path(deploy.Args()), weights_only=True)
+    counts, rng = collections.defaultdict(collections.Counter), np.random.default_rng(0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "checkpoint.pt"
+        for case, content in hostile(data, rng, 10 if args.quick else 300):
+            path.write_bytes(content)
+            for load in LOADERS:
+                counts[case] += read(load, path)
+        with open(path, "wb") as file:  # takes no space on the disk
+            file.truncate(2 * deploy.MAX_CHECKPOINT_BYTES)
+        for load in LOADERS:
+            counts["larger than a gigabyte"] += read(load, path)
+    return [result("checkpoints", case, sum(found.values()), found["refused"] + found["loaded"], f"{found['loaded']} of them loaded")
+            for case, found in counts.items()]  # fmt: skip
+
+
+# Many deployments
+
+
+def deployments(args):
+    """Controllers built anew from their checkpoint, each for a few steps from a start, to a goal and on a plant of its own."""
+    most, steps, rng, sizes = 20 if args.quick else 2_000, 5, np.random.default_rng(0), []
+    for i in range(most):
+        controller = deploy.build_controller("rl_mpc", deploy.Args())
+        x, goal, psi = draw(controller.plant, rng)
+        controller.set_goal(goal)
+        for _ in range(steps):
+            x = controller.plant.step(x, controller.make_step(x), psi)
+        if i + 1 in (most // 10, most):
+            sizes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e3 if sys.platform == "linux" else 1e6))
+    grown = sizes[1] - sizes[0]
+    detail = f"{sizes[0]:.0f} MB at the most up to {most // 10}, {sizes[1]:.0f} MB up to {most}"
+    return [result("deployments", "memory grows by less than 10 MB", most, most * (grown < 10), detail)]
+
+
+# Twice the same
+
+
+def determinism(args):
+    """The whole reproduction twice: every table, and the weights of every critic."""
+    steps = [step.name for step in reproduce.STEPS if not step.name.startswith("reliability")]
+    steps = ["critic_cstr_robust", "cstr_profile", "linear_scalability_main"] if args.quick else steps
+    found = {}
+    for processes in (1, 2):
+        folder = args.runs / f"determinism_{processes}"
+        shutil.rmtree(folder, ignore_errors=True)
+        command = [
+            "--quick",
+            "--jobs",
+            3 - processes,
+            "--step-jobs",
+            processes,
+            "--out",
+            folder,
+            "--runs",
+            folder / "runs",
+            "--only",
+            *steps,
+        ]
+        command = [sys.executable, "experiments/reproduce.py", *map(str, command)]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        found[processes] = {path.name: without_times(path) for path in sorted((folder / "results").glob("*.csv"))}
+        found[processes] |= {path.name: torch.load(path, weights_only=True) for path in sorted((folder / "pretrained").glob("*.pt"))}
+    rows = []
+    for kind, case in ((".csv", "tables: the same but for times"), (".pt", "critics: the same weights")):
+        names = sorted(name for name in set(found[1]) | set(found[2]) if name.endswith(kind))
+        different = [name for name in names if not equal(found[1].get(name), found[2].get(name))]
+        rows.append(result("determinism", case, len(names), len(names) - len(different), ", ".join(different)))
+    return rows
+
+
+def main(args):
+    table = f"reliability_{args.study}.csv"
+    cells.check(args, table, jobs=(1, 1024))
+    args.runs.mkdir(parents=True, exist_ok=True)
+    if not args.plot_only:
+        study = {"controllers": controllers, "training": training, "checkpoints": checkpoints, "deployments": deployments,
+                 "determinism": determinism}[args.study]  # fmt: skip
+        cells.write(study(args), args.out / "results" / table)
+    for row in cells.read(args.out / "results" / table):
+        print("  ".join(f"{key} {value}" for key, value in row.items()))
+
+
+if __name__ == "__main__":
+    cells.run(main, tyro.cli(Args, description=__doc__))
