@@ -21,17 +21,9 @@ It writes `runs/{env}__goal_mpc__{seed}__{time}/`: results.csv (a row per seed),
 episode.gif. Only the folder `envs/` is needed beside this file.
 """
 
-import contextlib
 import csv
-import hashlib
-import os
-import platform
-import re
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,10 +35,11 @@ import tyro
 from tqdm import tqdm
 
 import envs
+from envs.tools.compiled import compiled_solver
+from envs.tools.figure import draw_episode
 
 RADAU_DEGREE = 3
 METRIC_SIGMA2 = 0.01  # of time near goal, squared units of the plant's goal error
-COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 
 
 @dataclass(frozen=True)
@@ -112,38 +105,6 @@ class Args:
 
 
 # Scenario MPC
-
-
-def compiled_solver(plugin, nlp, options):
-    """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
-
-    The C code of the problem and its derivatives is compiled once and kept in a cache folder under a hash of source, compiler
-    and processor; it appears there by an atomic rename, so that parallel processes may race for it. Where anything of that
-    fails (no compiler, no place to write, a library that does not load), a notice is printed and None returned.
-    """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-    try:
-        if compiler is None:
-            raise OSError("no gcc, clang or cc")
-        version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
-        cpu = Path("/proc/cpuinfo")
-        flags = re.search(r"^(flags|Features)\s*:.*", cpu.read_text(), re.MULTILINE) if cpu.exists() else None
-        processor = flags[0] if flags else platform.processor()
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
-            ca.nlpsol("nlp", plugin, nlp, options("cold")).generate_dependencies("nlp.c")
-            source = Path("nlp.c").read_bytes()
-            key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
-            library = cache / f"{key}.so"
-            if not library.exists():
-                cache.mkdir(parents=True, exist_ok=True)
-                built = cache / f"{key}.{os.getpid()}"
-                subprocess.run([compiler, *COMPILER_FLAGS, "nlp.c", "-o", str(built), "-lm"], check=True, capture_output=True)
-                os.replace(built, library)
-        return {name: ca.nlpsol(name, plugin, str(library), options(name)) for name in ("cold", "warm")}
-    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
-        return None
 
 
 class ScenarioMPC:
@@ -634,49 +595,6 @@ def table(rows):
     return "\n".join(lines)
 
 
-def wrapped(angle):
-    """Angles moved into [-pi/2, 3 pi/2), so that neither upright (0) nor hanging (pi) is at the edge; jumps are cut by NaN."""
-    angle = (np.asarray(angle) + np.pi / 2) % (2 * np.pi) - np.pi / 2
-    return np.where(np.abs(np.diff(angle, prepend=angle[:1])) > np.pi, np.nan, angle)
-
-
-def figure(plant, x, u, goals, path):
-    """Trajectory of one episode: a panel per goal state, constrained state and action, with bounds and goal."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    n_x, time_axis = len(plant.X_LOW), np.arange(len(x)) * plant.DT
-    low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
-    titles = [f"{n} [{v}]" for n, v in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
-    shown = [i for i in range(len(low)) if i in plant.GOAL_INDEX or np.isfinite(low[i])]
-    if len(shown) > 12:  # of a large plant, the first few
-        shown = [i for i in shown if i < 4 or n_x <= i < n_x + 2]
-    values = np.hstack([x, np.vstack([u, u[-1:]])])
-    fig, axes = plt.subplots(len(shown), 1, figsize=(8, 0.7 + 1.5 * len(shown)), sharex=True, layout="constrained", squeeze=False)
-    for ax, i in zip(axes.ravel(), shown):
-        angle = i in plant.ANGLES
-        if i in plant.GOAL_INDEX:
-            goal = goals[:, plant.GOAL_INDEX.index(i)]
-            goal = np.append(goal[:1], goal)  # goals are those of x_1 ...
-            ax.plot(time_axis, wrapped(goal) if angle else goal, color="#CC79A7", lw=2, ls=(0, (1, 1)), drawstyle="steps-pre", label="goal")
-        drawn = wrapped(values[:, i]) if angle else values[:, i]
-        ax.plot(time_axis, drawn, color="#0072B2", lw=1.8, drawstyle="default" if i < n_x else "steps-post", label="closed loop")
-        for bound in filter(np.isfinite, (low[i], high[i])):
-            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
-        if angle:
-            ax.set_yticks([0, np.pi], ["0 (up)", "π (down)"])
-            ax.set_ylim(-np.pi / 2 - 0.1, 3 * np.pi / 2 + 0.1)
-        ax.set_title(titles[i], fontsize=10, loc="left")
-    axes[-1, 0].set_xlim(0, time_axis[-1])
-    axes[-1, 0].set_xlabel(f"time [{plant.TIME_UNIT}]")
-    handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
-    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
-
-
 def fail(message):
     """A user's mistake: one sentence, exit code 2, no traceback."""
     print(f"error: {message}", file=sys.stderr)
@@ -754,7 +672,8 @@ def main(args):
             episodes.append((x, u, predicted))
     write_csv(rows, out / "results.csv")
     np.savez_compressed(out / "trajectories.npz", goals=goals, **{k: np.stack([e[i] for e in episodes]) for i, k in enumerate("xu")})
-    figure(plant, *episodes[0][:2], goals, out / "episode.png")
+    x, u, _ = episodes[0]
+    draw_episode(plant, {"closed loop": (x, u, {"color": "#0072B2"})}, goals, out / "episode.png")
     if args.animate:
         plant.animate(*episodes[0], goals, out / "episode.gif")
     print(table(rows))

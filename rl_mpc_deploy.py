@@ -21,19 +21,11 @@ It writes `runs/{env}__rl_mpc_deploy__{seed}__{time}/`: results.csv (a row per c
 episode.png. Only the folder `envs/` is needed beside this file, and a checkpoint.
 """
 
-import contextlib
 import csv
-import hashlib
 import json
 import multiprocessing
-import os
-import platform
-import re
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -52,12 +44,14 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 import envs
+from envs.tools.compiled import compiled_solver
+from envs.tools.expansion import Expansion, TaylorValue, with_derivatives
+from envs.tools.figure import draw_episode
 
 # arguments that results.csv has columns for, or that change no result
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "steps", "jobs", "controllers", "compile", "out"}
 MAX_CHECKPOINT_BYTES = 10**9
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
-COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
 
 
@@ -90,7 +84,7 @@ class Args:
     """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step; default: 2 with a critic
     that was trained with --constraint-weight, 1 with one that was not, as in the paper"""
     constraints: Literal["soft", "hard"] = "soft"
-    """RL+MPC: hard is the paper's variant that gets stuck or infeasible"""
+    """RL+MPC: hard forbids every violation, as in the paper's variant, whose problem may have no solution or none that moves on"""
     value: Literal["exact", "taylor", "taylor-local"] = "exact"
     """RL+MPC: V itself, or its concave second-order expansion about the goal, or about where each scenario's first guess ends"""
     combine: Literal["min", "first", "mean"] = "first"
@@ -179,6 +173,14 @@ class Critic:
         angles = concat([x, goal])[s["angle_index"], :]
         return concat([concat([(x - s["x_center"]) / s["x_scale"], g])[s["other_index"], :], xp.sin(angles), xp.cos(angles)])
 
+    def layers(self):
+        """(W, b) of every layer, b a column: of the actor, whose last gives the mean alone, and of the twin critics."""
+        n_u, actor = self.network["n_u"], [*self.actor.layers, self.actor.head]
+        actor = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()[:, None]) for layer in actor]
+        actor[-1] = tuple(v[:n_u] for v in actor[-1])
+        pairs = list(zip(self.critic.weight, self.critic.bias))
+        return actor, [[(w[j].T.detach().numpy(), b[j].T.detach().numpy()) for w, b in pairs] for j in range(2)]
+
     def example(self):
         """A network input in physical units: the plant's start state, below it a mismatch of zero if that is observed, and a goal."""
         start = np.asarray(self.plant.START, dtype=float)
@@ -226,17 +228,6 @@ def load_critic(path, env, combine="first"):
 # CasADi export
 
 
-def layers(critic):
-    """(W, b) of every layer, b a column: of the actor, whose last gives the mean alone, and of the twin critics."""
-    n_u = critic.network["n_u"]
-    actor = [(layer.weight.detach().numpy(), layer.bias.detach().numpy()[:, None]) for layer in [*critic.actor.layers, critic.actor.head]]
-    actor[-1] = tuple(v[:n_u] for v in actor[-1])
-    twins = [
-        [(w[j].T.detach().numpy(), b[j].T.detach().numpy()) for w, b in zip(critic.critic.weight, critic.critic.bias)] for j in range(2)
-    ]
-    return actor, twins
-
-
 def export(critic):
     """CasADi functions mu(x, goal) -> u, Q(x, u, goal) -> (min or first or mean) and V(x, goal), physical units, float64.
 
@@ -249,7 +240,7 @@ def export(critic):
             h = h * (1 + ca.tanh(h / 2)) / 2  # SiLU; exp(-h) would overflow in its derivatives
         return layers[-1][0] @ h + layers[-1][1]
 
-    s, (actor, twins) = critic.scaling, layers(critic)
+    s, (actor, twins) = critic.scaling, critic.layers()
     n_x = len(critic.plant.X_LOW)
     x, goal, u = (ca.MX.sym(name, n) for name, n in (("x", n_x), ("goal", s["goal_center"].size), ("u", s["u_center"].size)))
     seen = [ca.MX.sym("mismatch", n_x)] if critic.mismatch_scale else []
@@ -260,96 +251,6 @@ def export(critic):
     Q = ca.Function("Q", [x, u, goal, *seen], [combined])
     V = ca.Function("V", [x, goal, *seen], [Q(x, mu(x, goal, *seen), goal, *seen)], ["x", "goal", "mismatch"][: 2 + len(seen)], ["V"])
     return mu, Q, V
-
-
-class Expansion(ca.Callback):
-    """CasADi function (x, goal) -> V, its gradient (n_x,), its Hessian (n_x, n_x), physical units, that computes in numpy.
-
-    The Hessian of a chain of linear maps and elementwise functions f is the sum over all of their inputs a of
-    (adjoint of f(a)) f''(a) (da/dx)'(da/dx): a few matrix products, where CasADi would send n_x directions through the networks one by one
-    (0.6 ms against 14 at n_x = 32, an actor and a critic of 256 x 256). Whoever uses it must keep it: CasADi does not.
-    """
-
-    def __init__(self, critic):
-        ca.Callback.__init__(self)
-        self.combine, (self.actor, twins) = critic.combine, layers(critic)
-        self.twins = twins[:1] if self.combine == "first" else twins
-        sizes = (("x", critic.scaling["x_center"].size), ("goal", critic.scaling["goal_center"].size), ("adjoint", critic.network["n_in"]))
-        x, goal, adjoint = (ca.MX.sym(*size) for size in sizes)
-        self.shapes, z = (x.shape, goal.shape, (x.numel(), x.numel())), critic.features(x, goal, ca)
-        self.features = ca.Function("features", [x, goal], [z, ca.jacobian(z, x)])
-        self.bend = ca.Function("bend", [x, goal, adjoint], [ca.hessian(ca.dot(adjoint, z), x)[0]])  # zero unless there are angles
-        self.point, self.result = None, None  # the last: solvers ask for slope and curvature one after the other
-        self.construct("expansion")
-
-    def get_n_in(self):
-        return 2
-
-    def get_n_out(self):
-        return 3
-
-    def get_sparsity_in(self, i):
-        return ca.Sparsity.dense(*self.shapes[i])
-
-    def get_sparsity_out(self, i):
-        return ca.Sparsity.dense(*((1, 1), self.shapes[0], self.shapes[2])[i])
-
-    def eval(self, arguments):
-        point = np.concatenate([np.array(value).ravel() for value in arguments])
-        if self.point is None or (point != self.point).any():
-            self.point, self.result = point, self._expand(arguments)
-        return self.result
-
-    def _expand(self, arguments):
-        def forward(layers, h, J):
-            """Output, its Jacobian, and what `backward` needs of each hidden layer: W, da/dx, f'(a), f''(a)."""
-            tape = []
-            for w, b in layers[:-1]:
-                a, J = w @ h + b, w @ J
-                p = (1 + np.tanh(a / 2)) / 2  # SiLU is a p
-                tape.append((w, J, p * (1 + a * (1 - p)), p * (1 - p) * (2 + a * (1 - 2 * p))))
-                h, J = a * p, tape[-1][2] * J
-            return layers[-1][0] @ h + layers[-1][1], layers[-1][0] @ J, tape
-
-        def backward(layers, tape, adjoint):
-            """Adjoint of the input and the share of the Hessian, from the adjoint of the output."""
-            adjoint, hessian = layers[-1][0].T @ adjoint, 0
-            for w, J, first, second in reversed(tape):
-                hessian += J.T @ (adjoint * second * J)
-                adjoint = w.T @ (adjoint * first)
-            return adjoint, hessian
-
-        z, J = (np.array(value) for value in self.features(*arguments))
-        mean, J_mean, actor_tape = forward(self.actor, z, J)
-        action = np.tanh(mean)
-        slope, results = 1 - action**2, []
-        for twin in self.twins:
-            q, _, tape = forward(twin, np.vstack([z, action]), np.vstack([J, slope * J_mean]))
-            adjoint, hessian = backward(twin, tape, np.ones((1, 1)))
-            d_z, d_action = np.vsplit(adjoint, [len(z)])
-            through_actor, more = backward(self.actor, actor_tape, d_action * slope)
-            d_z += through_actor
-            hessian += more + J_mean.T @ (d_action * -2 * action * slope * J_mean) + np.array(self.bend(*arguments, d_z))
-            results.append((q, J.T @ d_z, hessian))
-        if self.combine == "min":
-            return min(results, key=lambda result: result[0])
-        return [sum(values) / len(results) for values in zip(*results)]
-
-
-def with_derivatives(V, expansion):
-    """V with the derivatives of its expansion with respect to x, and none with respect to the goal, in place of CasADi's own."""
-    x, goal = ca.MX.sym("x", V.numel_in(0)), ca.MX.sym("goal", V.numel_in(1))
-    n, m = x.numel(), goal.numel()
-    state, by_goal, named = ca.MX.sym("state", n + m), ca.MX(1, m), {"never_inline": True, "enable_forward": False, "enable_reverse": False}
-    parts = ca.vertsplit(state, [0, n, n + m])
-    _, gradient, hessian = expansion(*parts)
-    blocks = [ca.diagcat(hessian, ca.MX(m, m)), ca.MX(n + m, 1)]
-    jac_jac = ca.Function("jac_jac_value", [state, ca.MX(1, 1), ca.MX(1, n + m)], blocks,
-                          ["state", "out_v", "out_jac_v_state"], ["jac_jac_v_state_state", "jac_jac_v_state_out_v"], named)  # fmt: skip
-    jac = ca.Function("jac_value", [state, ca.MX(1, 1)], [ca.horzcat(gradient.T, by_goal)], ["state", "out_v"], ["jac_v_state"],
-                      named | {"custom_jacobian": jac_jac})  # fmt: skip
-    value = ca.Function("value", [state], [V(*parts)], ["state"], ["v"], named | {"custom_jacobian": jac})
-    return ca.Function("V", [x, goal], [value(ca.vertcat(x, goal))], ["x", "goal"], ["V"])
 
 
 def check_export(critic, V, points=64, tolerance=1e-8):
@@ -372,84 +273,7 @@ def check_export(critic, V, points=64, tolerance=1e-8):
     return worst
 
 
-class TaylorValue:
-    """V(., goal) replaced by its second-order expansion, for a solver that then needs no derivatives of a network.
-
-    -V need not be convex, and a quadratic terminal cost that is not has its minimum at the end of the world. So its Hessian, in units of
-    the box of initial states, is projected: negative eigenvalues become zero.
-    """
-
-    def __init__(self, V, expansion, goal, scale):
-        self.V, self.expansion, self.goal, self.scale, n = V, expansion, goal, scale, len(scale)
-        x, theta = ca.MX.sym("x", n), ca.MX.sym("theta", 1 + 2 * n + n**2)
-        # -V at x, from a column (centre, -V there, -gradient, projected -Hessian) of `parameters`
-        center, v, slope, curvature = ca.vertsplit(theta, np.cumsum([0, n, 1, n, n**2]).tolist())
-        dx = (x - center) / scale
-        cost = v + ca.dot(slope, dx) + ca.bilin(ca.reshape(curvature, n, n), dx, dx) / 2
-        self.cost = ca.Function("taylor", [x, theta], [cost])
-
-    def parameters(self, x, order=2):
-        """Coefficients of the expansions about the states x (n_x, points), (1 + 2 n_x + n_x^2, points); of order 0: V there, held."""
-        columns = []
-        for point in x.T:
-            if order == 0:
-                columns.append(np.concatenate([point, [-float(self.V(point, self.goal))], np.zeros(len(point) * (1 + len(point)))]))
-                continue
-            v, gradient, hessian = (np.array(value) for value in self.expansion(point, self.goal))
-            eigenvalues, vectors = np.linalg.eigh(-hessian * np.outer(self.scale, self.scale))
-            projected = vectors * np.maximum(eigenvalues, 0) @ vectors.T
-            columns.append(np.concatenate([point, -v.ravel(), -gradient.ravel() * self.scale, projected.ravel()]))
-        return np.stack(columns, axis=1)
-
-
 # Scenario MPC
-
-
-def vectorised(source):
-    """CasADi's C code with the loops of its dense matrix product in an order that compilers turn into vector instructions.
-
-    The terms of every sum keep their order. It triples the speed of the networks' Hessians; text that is not found is left as it is.
-    """
-    start = source.find("void casadi_mtimes_dense(")
-    head, product, rest = source[:start], source[start : start + 800], source[start + 800 :]
-    for name in ("x", "y", "z"):
-        product = product.replace(f"casadi_real* {name},", f"casadi_real* restrict {name},", 1)
-    rows, terms = "for (j=0; j<nrow_x; ++j) {", "for (k=0; k<ncol_x; ++k) {"
-    product = re.sub(f"{re.escape(rows)}(\\s+){re.escape(terms)}", rf"{terms}\1{rows}", product)
-    return head + product + rest if start >= 0 else source
-
-
-def compiled_solver(nlp, options):
-    """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
-
-    The C code of the problem and its derivatives is compiled once and kept in a cache folder under a hash of source, compiler
-    and processor; it appears there by an atomic rename, so that parallel processes may race for it. Where anything of that
-    fails (no compiler, no place to write, a library that does not load), a notice is printed and None returned.
-    """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-    try:
-        if compiler is None:
-            raise OSError("no gcc, clang or cc")
-        version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
-        cpu = Path("/proc/cpuinfo")
-        flags = re.search(r"^(flags|Features)\s*:.*", cpu.read_text(), re.MULTILINE) if cpu.exists() else None
-        processor = flags[0] if flags else platform.processor()
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
-            ca.nlpsol("nlp", "ipopt", nlp).generate_dependencies("nlp.c")
-            source = vectorised(Path("nlp.c").read_text()).encode()
-            Path("nlp.c").write_bytes(source)
-            key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
-            library = cache / f"{key}.so"
-            if not library.exists():
-                cache.mkdir(parents=True, exist_ok=True)
-                built = cache / f"{key}.{os.getpid()}"
-                subprocess.run([compiler, *COMPILER_FLAGS, "nlp.c", "-o", str(built), "-lm"], check=True, capture_output=True)
-                os.replace(built, library)
-        return {name: ca.nlpsol(name, "ipopt", str(library), options(name)) for name in ("cold", "warm")}
-    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
-        return None
 
 
 class ScenarioMPC:
@@ -601,7 +425,7 @@ class ScenarioMPC:
         def options(name):
             return {"ipopt": common | (warm if name == "warm" else {}), "print_time": False, "show_eval_warnings": False}
 
-        self.solvers = compiled_solver(self.nlp, options) if compile else None
+        self.solvers = compiled_solver("ipopt", self.nlp, options) if compile else None
         self.compiled = self.solvers is not None
         if not self.compiled:
             self.solvers = {name: ca.nlpsol(name, "ipopt", self.nlp, options(name)) for name in ("cold", "warm")}
@@ -670,6 +494,12 @@ class ScenarioMPC:
         if hasattr(self.plant, "baseline"):
             return self._rollout(x0, lambda t, x: self.plant.baseline(x, self.goal[:, None]))
         return self.hold_guess(x0)
+
+    def other_guess(self, x0):
+        """One that differs from `cold_guess`: `hold_guess`, or where that was the first the rollout of the last action."""
+        if self.actor is not None or hasattr(self.plant, "baseline"):
+            return self.hold_guess(x0)
+        return self._rollout(x0, lambda t, x: np.tile(self.u_before[:, None], x.shape[1]))
 
     def set_initial_guess(self, x0):
         """Forget the previous plan: the next solve starts from `cold_guess`."""
@@ -756,7 +586,7 @@ class ScenarioMPC:
             solution = self._solve(start, x0, self.slack_price, *guess)
         if solution is None:
             self.stats |= {"success": False, "rung": "retry"}
-            other = self.cold_guess(x0) if start == "warm" or relaxed is not None else self.hold_guess(x0)
+            other = self.cold_guess(x0) if start == "warm" or relaxed is not None else self.other_guess(x0)
             self._expand(other)
             solution = self._solve("cold", x0, self.slack_price if relaxed is None else relaxed, other)
         self.infeasible = relaxed is not None and not self.stats["success"]
@@ -812,7 +642,8 @@ class ActorController:
         success = bool(np.isfinite(u).all())  # not so far from where networks were trained; then the last action stays
         self.u_before = np.clip(u if success else self.u_before, self.plant.U_LOW, self.plant.U_HIGH)
         self.estimator.before = x0, self.u_before
-        self.stats = {"success": success, "rung": "solved" if success else "hold", "wall_ms": 1e3 * (time.perf_counter() - tick)}
+        self.stats = {"success": success, "rung": "solved" if success else "hold", "status": "", "iterations": 0,
+                      "wall_ms": 1e3 * (time.perf_counter() - tick)}  # fmt: skip
         return self.u_before.copy()
 
     def act(self, x0, *seen):
@@ -857,7 +688,7 @@ def build_controller(name, args):
     if name not in LABELS:
         raise ValueError(f"{name!r} is not a controller; choose one of {', '.join(LABELS)}")
     greedy = name == "rl_mpc" and args.horizon == 0
-    critic = load_critic(critic_path(args), args.env, "min" if greedy else args.combine)
+    critic = load_critic(critic_path(args), args.env, combine(args))
     plant = critic.plant
     compile = args.compile and not hasattr(plant, "next_state")
     mu, Q, V = export(critic)
@@ -876,7 +707,7 @@ def build_controller(name, args):
     if name in ("rl_mpc", "goal_mpc"):
         sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
         stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-        learned, expansion = {}, None if critic.mismatch_scale else Expansion(critic)
+        learned, expansion = {}, None if critic.mismatch_scale or compile and args.value == "exact" else Expansion(critic)
         if name == "rl_mpc" and args.value == "exact":
             V = V if compile or expansion is None else with_derivatives(V, expansion)
             seen = [ca.MX.sym("mismatch", len(plant.X_LOW))] if critic.mismatch_scale else []
@@ -908,6 +739,11 @@ def settled_state(plant, mu, goal, steps=1000):
     for _ in range(steps):
         x = plant.step(x, np.array(mu(x, goal)).ravel(), plant.PSI_NOMINAL)
     return x
+
+
+def combine(args):
+    """Which of the twin critics V takes: without a solver, whom kinks would stall, their minimum."""
+    return "min" if args.horizon == 0 else args.combine
 
 
 def critic_path(args):
@@ -1002,8 +838,9 @@ def compare(args):
 
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC", "goal_mpc": "RL+MPC, no value",
           "rl_mpc": "RL+MPC"}  # fmt: skip
-STYLES = {"actor": ("#D55E00", "--"), "nominal_mpc": ("#999999", ":"), "robust_mpc": ("#0072B2", "-."),
-          "goal_mpc": ("#E69F00", (0, (4, 1, 1, 1, 1, 1))), "rl_mpc": ("#009E73", "-")}  # fmt: skip
+STYLES = {"actor": {"color": "#D55E00", "ls": "--"}, "nominal_mpc": {"color": "#999999", "ls": ":"},
+          "robust_mpc": {"color": "#0072B2", "ls": "-."}, "goal_mpc": {"color": "#E69F00", "ls": (0, (4, 1, 1, 1, 1, 1))},
+          "rl_mpc": {"color": "#009E73"}}  # fmt: skip
 
 
 def label(row):
@@ -1038,44 +875,6 @@ def write_csv(rows, path):
     path.with_suffix(".tmp").replace(path)
 
 
-def figure(plant, args, rows, paths, goal, path, episode=0):
-    """Trajectories of one episode: a panel per state and action, with bounds and goal."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
-    titles = [f"{n} [{u}]" for n, u in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
-    shown = list(range(len(low)))
-    if len(shown) > 12:  # of a large plant, the first few
-        shown = [i for i in shown if i < 4 or len(plant.X_LOW) <= i < len(plant.X_LOW) + 2]
-    fig, axes = plt.subplots(-(-len(shown) // 3), 3, figsize=(10, 5.2), sharex=True, layout="constrained", squeeze=False)
-    times, names = np.arange(args.steps + 1) * plant.DT, {row["controller"]: label(row) for row in rows}
-    for i, ax in zip(shown, axes.ravel()):
-        for name, (x, u) in paths.items():
-            values = np.hstack([x[episode], np.vstack([u[episode], u[episode][-1:]])])[:, i]
-            (colour, dashes), style = STYLES[name], "default" if i < len(plant.X_LOW) else "steps-post"
-            ax.plot(times, values, color=colour, ls=dashes, lw=1.8, drawstyle=style, label=names[name])
-        for bound in (low[i], high[i]):
-            if np.isfinite(bound):
-                ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
-        if i in plant.GOAL_INDEX:
-            ax.axhline(goal[plant.GOAL_INDEX.index(i)], color="#CC79A7", lw=1.5, ls=(0, (1, 1)), label="goal")
-        ax.set_title(titles[i], fontsize=10)
-    for ax in axes.ravel()[len(shown) :]:
-        ax.set_visible(False)
-    for ax in axes.ravel()[max(len(shown) - 3, 0) : len(shown)]:
-        ax.xaxis.set_tick_params(labelbottom=True)
-        ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
-    if len(shown) < len(low):
-        axes[0, 0].set_title(f"{titles[0]} (4 of {len(plant.X_LOW)} states)", fontsize=10)
-    handles = {text: h for ax in axes.ravel() for h, text in zip(*ax.get_legend_handles_labels())}
-    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
-
-
 def fail(message):
     """A user's mistake: one sentence, exit code 2, no traceback."""
     print(f"error: {message}", file=sys.stderr)
@@ -1099,7 +898,7 @@ def check(args):
     if args.critic is None and not critic_path(args).exists():
         fail(f"--critic is missing: none is shipped for {args.env}; train one with python sac_her_branching.py --env {args.env}")
     try:
-        critic = load_critic(critic_path(args), args.env, args.combine)
+        critic = load_critic(critic_path(args), args.env, combine(args))
     except ValueError as error:
         fail(f"--critic {error}")
     unused = {
@@ -1107,6 +906,9 @@ def check(args):
         "filter_gain": (not args.offset_free and not critic.mismatch_scale, "without --offset-free"),
         "slack_weight": (args.constraints == "hard", "on hard constraints"),
     }
+    if args.horizon == 0:
+        names = ("robust_horizon", "sigma", "slack_weight", "constraints", "value", "combine")
+        unused |= {name: (True, "at --horizon 0") for name in names}
     for name, (is_unused, why) in unused.items():
         if is_unused and getattr(args, name) != getattr(Args, name):
             fail(f"--{name.replace('_', '-')} {getattr(args, name)} has no effect {why}")
@@ -1116,8 +918,8 @@ def check(args):
         fail(f"--value is {args.value}; a critic that observes the mismatch needs exact")
     plant = critic.plant
     leaves = len(plant.SCENARIOS["mpc"]) ** min(args.robust_horizon, max(args.horizon, 1))
-    if leaves > 1000:
-        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; at most 1000 are allowed")
+    if leaves * args.horizon > 20_000:
+        fail(f"--robust-horizon {args.robust_horizon} gives a tree of {leaves} leaves; leaves times --horizon may be 20000 at most")
     goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal)
     if goal.shape != plant.EVAL_GOAL.shape or not ((plant.GOAL_LOW <= goal) & (goal <= plant.GOAL_HIGH)).all():
         low, high = (np.array2string(bound, threshold=4, edgeitems=1) for bound in (plant.GOAL_LOW, plant.GOAL_HIGH))
@@ -1146,7 +948,9 @@ def main(args):
     rows, paths = compare(args)
     write_csv(rows, out / "results.csv")
     np.savez_compressed(out / "trajectories.npz", **{f"{name}_{k}": v for name, xu in paths.items() for k, v in zip("xu", xu)})
-    figure(plant, args, rows, paths, goal, out / "episode.png")
+    labels = {row["controller"]: label(row) for row in rows}
+    first = {labels[name]: (x[0], u[0], STYLES[name]) for name, (x, u) in paths.items()}
+    draw_episode(plant, first, np.tile(goal, (args.steps, 1)), out / "episode.png")
     print(table(rows))
     print(f"{time.perf_counter() - tick:.0f} s with {args.jobs} processes; {out}/results.csv, trajectories.npz, episode.png")
     return rows

@@ -4,13 +4,13 @@
 # ///
 """Soft actor-critic with hindsight experience replay over branched rollouts: a robust goal-conditioned critic.
 
-The plant's uncertain parameters psi are drawn anew from a scenario set at every step (eq:offlineMDP), so that the critic
+The plant's uncertain parameters psi are drawn anew from a scenario set, by default at every step (eq:offlineMDP), so that the critic
 learns the value averaged over scenarios (eq:robustQ). With `--branches K` every transition carries K next states under
 independently drawn scenarios, and their *targets* are averaged:
 
     y = 1/K sum_i [ r(s'_i, g) + gamma ( min_j Qbar_j(s'_i, a'_i, g) - alpha log pi(a'_i | s'_i, g) ) ],   a'_i ~ pi(. | s'_i, g)
 
-HER (eq:relabeled) replaces the goal of most samples by something that the same episode achieved later.
+HER (eq:relabeled) replaces the goal of most samples by something that the same episode achieved, by default later.
 
     python sac_her_branching.py --env cstr                        # the robust agent of the paper's Example 3
     python sac_her_branching.py --env cstr --scenarios nominal    # the nominal agent it is compared with
@@ -579,6 +579,15 @@ def check(args):
         fail("--add-plant-data does not go with --observe-mismatch, which its states lack")
     if args.add_plant_data and args.branches > 1:
         fail(f"--branches is {args.branches}; --add-plant-data needs 1, since a plant gives one next state per action")
+    without = [("reward_tolerance", args.smooth_reward, "--smooth-reward"), ("reward_sigma2", not args.smooth_reward, "--no-smooth-reward"),
+               ("her_strategy", args.her_ratio == 0, "--her-ratio 0")]  # fmt: skip
+    for name, unused, setting in without:
+        if unused and getattr(args, name) != getattr(Args, name):
+            fail(f"--{name.replace('_', '-')} {getattr(args, name)} has no effect with {setting}")
+    if args.learning_starts >= args.total_timesteps:
+        print(
+            f"warning: nothing is learnt, since --learning-starts is {args.learning_starts}, not below --total-timesteps", file=sys.stderr
+        )
     if args.device == "cuda" and not torch.cuda.is_available():
         fail("--device is cuda, but torch finds no CUDA device here; use auto or cpu")
     return plant

@@ -27,6 +27,8 @@ optional, for goal_mpc.py: GOALS (by name), expert_cost(x, xp) and EXPERT_CHANGE
 A family of plants (`envs/linear.py`) defines `make(dim, system)` instead, which returns an object with these names. A plant in discrete
 time has next_state(x, u, psi, xp) instead of ode; one with a linear-quadratic regulator lqr, lq_cost, lq_value, feedback and baseline.
 
+The folder `tools` holds what the scripts share beside plants.
+
 `GoalEnv` and `VectorGoalEnv` below turn such a module into environments; importing `envs` registers one id per module.
 """
 
@@ -66,7 +68,7 @@ def rk4(ode, x, u, psi, dt, substeps, xp=np):
 
 def names():
     """Names of the plants in this folder, the values that `--env` takes."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+    return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.ispkg)
 
 
 class Mismatch:
@@ -230,8 +232,11 @@ def checked_goal(plant, goal):
 class _PlantSpaces:
     """Spaces and observation layout that the single and the batched environment share."""
 
-    def _set_plant(self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance):
+    def _set_plant(self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold):
         self.plant = load(plant, **options)
+        if scenario_hold not in ("step", "episode"):
+            raise ValueError(f"scenario_hold={scenario_hold!r} is neither 'step' nor 'episode'")
+        self.hold = scenario_hold == "episode"
         if scenarios not in self.plant.SCENARIOS:
             raise ValueError(f"scenarios={scenarios!r} is not one of {', '.join(self.plant.SCENARIOS)}")
         self.scenarios = self.plant.SCENARIOS[scenarios]
@@ -261,14 +266,15 @@ class _PlantSpaces:
 class GoalEnv(_PlantSpaces, gym.Env):
     """One plant as a goal environment (`Dict` observation), in physical units.
 
-    At every step the parameters psi are drawn anew from the scenario set (eq:offlineMDP). `reset(options=...)` takes
-    `state` (n_x,), `goal` (n_goal,) and `psi` (n_psi,): a given psi is held for the episode.
+    At every step, or with scenario_hold="episode" once per episode, the parameters psi are drawn anew from the scenario set
+    (eq:offlineMDP). `reset(options=...)` takes `state` (n_x,), `goal` (n_goal,) and `psi` (n_psi,): a given psi is held for the episode.
     """
 
     metadata = {"render_modes": []}
 
-    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None, **options):
-        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
+    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None, scenario_hold="step",
+                 **options):  # fmt: skip
+        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold)
         self.observation_space, self.action_space = self._single_observation_space, self._single_action_space
 
     def reset(self, *, seed=None, options=None):
@@ -279,7 +285,7 @@ class GoalEnv(_PlantSpaces, gym.Env):
         if isinstance(self.plant, Mismatch):  # none yet
             state = np.append(state[: len(self.plant.MISMATCH_SCALE)], 0 * self.plant.MISMATCH_SCALE)
         self.x, self.goal = np.array(state, dtype=np.float64), np.array(goal, dtype=np.float64)
-        self.psi = options.get("psi")
+        self.psi = options.get("psi", self.np_random.choice(self.scenarios) if self.hold else None)
         return self._obs(self.x, self.goal), {}
 
     def step(self, action):
@@ -301,10 +307,7 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
 
     def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
                  branches=0, scenario_hold="step", max_episode_steps=None, **options):  # fmt: skip
-        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance)
-        if scenario_hold not in ("step", "episode"):
-            raise ValueError(f"scenario_hold={scenario_hold!r} is neither 'step' nor 'episode'")
-        self.hold = scenario_hold == "episode"
+        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold)
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
         self.single_observation_space, self.single_action_space = self._single_observation_space, self._single_action_space

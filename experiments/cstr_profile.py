@@ -21,17 +21,16 @@ import cells
 
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.tools.figure import draw_episode
 
 PAPER = dict(critic=HERE / "pretrained/cstr_robust.pt")
-CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, style)
-    "actor": ("actor", PAPER, "RL, paper's", ("#D55E00", "--")),
-    "robust_mpc": ("robust_mpc", {}, "robust MPC", ("#0072B2", "-.")),
-    "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", ("#56B4E9", "-")),
-    "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", ("#009E73", "-")),
-    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard"), "the same, hard constraints", ("black", (0, (1, 1.5)))),
+CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, lines)
+    "actor": ("actor", PAPER, "RL, paper's", {"color": "#D55E00", "ls": "--"}),
+    "robust_mpc": ("robust_mpc", {}, "robust MPC", {"color": "#0072B2", "ls": "-."}),
+    "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", {"color": "#56B4E9"}),
+    "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", {"color": "#009E73"}),
+    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard"), "the same, hard constraints", {"color": "black", "ls": (0, (1, 1.5))}),
 }
-for name, (_, _, label, style) in CONTROLLERS.items():
-    deploy.LABELS[name], deploy.STYLES[name] = label, style
 
 
 @dataclass
@@ -73,10 +72,13 @@ def main(args):
         cells.write([row for name in CONTROLLERS for row in profile(name, args)], table)
     rows, paths = cells.read(table), {}
     for name in CONTROLLERS:
-        values = np.array([[float(row[column]) for column in columns] for row in rows if row["controller"] == name])
-        paths[name] = values[None, :, :4], values[None, :-1, 4:]
+        mine = [row for row in rows if row["controller"] == name]
+        values = np.array([[float(row[column]) for column in columns] for row in mine])
+        label, style = CONTROLLERS[name][2:]
+        label += "" if name == "actor" else f", N = {mine[0]['horizon']}"
+        paths[label] = values[:, :4], values[:-1, 4:], style
     (args.out / "figures").mkdir(parents=True, exist_ok=True)
-    deploy.figure(cstr, deploy.Args(steps=len(values) - 1), rows, paths, [float(rows[0]["goal"])], args.out / "figures/cstr_profile.png")
+    draw_episode(cstr, paths, np.full((len(values) - 1, 1), float(rows[0]["goal"])), args.out / "figures/cstr_profile.png")
 
 
 if __name__ == "__main__":

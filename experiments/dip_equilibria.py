@@ -19,6 +19,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import goal_mpc as gm
 from envs import double_pendulum as plant
+from envs.tools.figure import draw_episode
 
 
 @dataclass
@@ -69,7 +70,8 @@ def plot(args):
     with open(args.out / "results/dip_profile.csv", newline="") as file:
         values = np.array([[float(v) for v in row.values()] for row in csv.DictReader(file)])[:, 1:]
     (args.out / "figures").mkdir(exist_ok=True)
-    gm.figure(plant, values[:, :6], values[:-1, 6:7], values[1:, 7:], args.out / "figures/dip_profile.png")
+    closed_loop = {"closed loop": (values[:, :6], values[:-1, 6:7], {"color": "#0072B2"})}
+    draw_episode(plant, closed_loop, values[1:, 7:], args.out / "figures/dip_profile.png")
     with open(args.out / "results/dip_equilibria.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     print(f"{'goal':10s}{'steps to reach it: median [max]':>34s}{'near over the last 20: median [min]':>38s}"

@@ -120,7 +120,9 @@ def draw(plant, rng, far=False):
 def spoil(controller, case, x, rng):
     """Bring the fault about; returns what is measured."""
     if case == "measurement not finite":
-        return np.where(rng.uniform(size=x.shape) < 0.5, rng.choice([np.nan, np.inf, -np.inf]), x)
+        bad = rng.uniform(size=x.shape) < 0.5
+        bad[rng.integers(len(x))] = True
+        return np.where(bad, rng.choice([np.nan, np.inf, -np.inf]), x)
     if case == "state far outside":
         reach = 10.0 ** rng.uniform(1, 12)
         return x + reach * rng.uniform(-1, 1, size=x.shape) * (controller.plant.INIT_HIGH - controller.plant.INIT_LOW)
@@ -188,7 +190,7 @@ def controllers(args):
         for case in (case for case in FAULTS if name in FAULTS[case]):
             steps = 10 if args.quick else STEPS.get((case, name), 1_000)
             rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
-    inputs = [Path(__file__), *(ROOT / "envs").glob("*.py"), Path(gm.__file__), Path(deploy.__file__)]
+    inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(gm.__file__), Path(deploy.__file__)]
     total = {}
     for row in cells.collect(closed_loop, rounds, args.jobs, args.runs, inputs):
         counts = total.setdefault((row["case"], row["controller"]), collections.Counter())
@@ -263,7 +265,7 @@ def killed(cell):
 def training(args):
     kills = 1 if args.quick else 12
     parts = [(branches, kills, seed) for seed in range(1 if args.quick else 2) for branches in (1, 4)]
-    inputs = [Path(__file__), *(ROOT / "envs").glob("*.py"), Path(sac.__file__)]
+    inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(sac.__file__)]
     found = cells.collect(killed, parts, args.jobs, args.runs, inputs)
     kills, half, mid_write = (sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write"))
     same = sum(row["same"] == "True" for row in found)

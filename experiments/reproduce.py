@@ -126,7 +126,10 @@ class Args:
 def version(quick):
     """Of all code that a step may run, and of the budget."""
     code = sorted(
-        path for folder in (".", "envs", "experiments") for path in (ROOT / folder).glob("*.py") if path.name != Path(__file__).name
+        path
+        for folder in (".", "envs", "envs/tools", "experiments")
+        for path in (ROOT / folder).glob("*.py")
+        if path.name != Path(__file__).name
     )
     return hashlib.sha256(b"".join(path.read_bytes() for path in code) + bytes([quick])).hexdigest()[:12]
 

@@ -16,6 +16,7 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import cstr
+from envs.tools import compiled
 
 ROOT = Path(__file__).parent.parent
 X0 = np.array([0.8, 0.5, 134.14, 130.0])
@@ -190,11 +191,11 @@ def test_loops_of_the_generated_code_are_reordered(checkpoint, tmp_path, monkeyp
     _, _, V = deploy.export(deploy.load_critic(checkpoint, "cstr", "first"))
     V.generate("V.c")
     before = Path("V.c").read_text()
-    after = deploy.vectorised(before)
+    after = compiled.vectorised(before)
     changed = [(a.split(), b.split()) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
     assert len(changed) == 4 and changed[2][0] == changed[3][1] and changed[3][0] == changed[2][1]  # two lines change places
     assert all(b.count("restrict") > 0 and [word for word in b if word != "restrict"] == a for a, b in changed[:2])
-    assert deploy.vectorised("int nothing;") == "int nothing;"
+    assert compiled.vectorised("int nothing;") == "int nothing;"
 
 
 def test_shifting_moves_time_and_not_channels():
