@@ -6,11 +6,11 @@
     python experiments/linear_value_mpc.py --study scaling           # solve time against n and against the horizon
     python experiments/linear_value_mpc.py --study profile --plot-only
 
-The agents are those of `python sac_her_branching.py --env linear --dim 32 --system I --seed I`; the scaling study has one more for each
-smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a price of 1
-(rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an expansion of -V about the goal (taylor) or about where the first
-guess ends (taylor-local). Beside them the goal-conditioned MPC of linear_scalability.py, whose costs contain the input and whose terminal
-cost is the regulator's.
+The agents are those of `python sac_her_branching.py --env linear --dim 32 --system 0 --seed 0`, and of 1 to 9; the scaling study has one
+more for each smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a
+price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an expansion of -V about the goal (taylor) or about
+where the first guess ends (taylor-local). Beside them the goal-conditioned MPC of linear_scalability.py, whose costs contain the input
+and whose terminal cost is the regulator's.
 
 Writes results/linear_value_mpc_NAME.csv for NAME in training, profile, distance, times, linear_value_mpc.csv (a row per closed loop of the
 profile study), and the figures linear_value_mpc.png, linear_value_mpc_distance.png and linear_value_mpc_times.png.

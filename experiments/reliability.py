@@ -201,7 +201,7 @@ def controllers(args):
 # Training
 
 
-TRAINING = ["--env", "cstr", "--hidden", "16", "16", "--total-timesteps", "6400", "--learning-starts", "320", "--eval-every", "1600",
+TRAINING = ["--env", "cstr", "--hidden", "16", "16", "--total-timesteps", "19200", "--learning-starts", "320", "--eval-every", "1600",
             "--eval-episodes", "20", "--save-every", "160", "--buffer-size", "3200"]  # fmt: skip
 
 
@@ -243,7 +243,7 @@ def killed(cell):
         while not finished:
             runs = list((folder / "killed").glob("*/resume.pt"))
             arguments = ["--resume", runs[0]] if runs else [*start, folder / "killed"]
-            finished = train(*arguments, kill_after=rng.uniform(0.2, 1) * seconds if landed < kills else None)
+            finished = train(*arguments, kill_after=rng.uniform(0.25, 0.6) * seconds if landed < kills else None)
             landed += not finished
             found = [path for name in ("resume.pt", "checkpoint.pt") for path in (folder / "killed").glob(f"*/{name}")]
             mid_write += any((folder / "killed").glob("*/*.tmp"))

@@ -101,6 +101,6 @@ def test_nothing_goes_wrong(study, quick):
         for row in csv.DictReader(open(folder / f"results/reliability_{study}.csv")):
             if study == "controllers":
                 assert row["wrong"] == "0" and row["refused"] == (row["faults"] if row["case"] == "measurement not finite" else "0"), row
-                assert int(row["recovered"]) >= 0.98 * int(row["chances"]), row
+                assert int(row["recovered"]) >= 0.95 * int(row["chances"]), row
             else:
                 assert row["held"] == row["trials"], row
