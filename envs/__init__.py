@@ -139,7 +139,8 @@ class Estimator:
         """Take the state (n_x,) that the last action led to."""
         if self.kind is None or self.before is None:
             return
-        found = x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = x - self.plant.step(*self.before, self.plant.PSI_NOMINAL)
         if not (np.abs(found) < (self.plant.INIT_HIGH - self.plant.INIT_LOW) / 2).all():  # a glitch of the measurement, not the plant
             return
         self.difference = self.difference + self.gain * (found - self.difference)

@@ -125,7 +125,7 @@ def figure(rows, labels, path):
     """The paper's boxen plot of both measures."""
     fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.4 * len(labels)), sharey=True, layout="constrained")
     rows = [row for label in labels for row in rows if row["variant"] == label]
-    colours = {row["variant"]: deploy.STYLES[row["controller"]][0] for row in rows}
+    colours = {row["variant"]: deploy.STYLES[row["controller"]]["color"] for row in rows}
     for ax, (key, title) in zip(axes, MEASURES.items()):
         data = {"variant": [row["variant"] for row in rows], title: [float(row[key]) for row in rows]}
         sns.boxenplot(data, x=title, y="variant", hue="variant", palette=colours, legend=False, flier_kws={"s": 4}, ax=ax)

@@ -409,7 +409,9 @@ def determinism(args):
             *steps,
         ]
         command = [sys.executable, "experiments/reproduce.py", *map(str, command)]
-        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        if out.returncode:
+            raise RuntimeError(out.stderr)
         found[processes] = {path.name: without_times(path) for path in sorted((folder / "results").glob("*.csv"))}
         found[processes] |= {path.name: torch.load(path, weights_only=True) for path in sorted((folder / "pretrained").glob("*.pt"))}
     rows = []

@@ -324,6 +324,32 @@ def test_draws_are_paired_and_do_not_depend_on_their_number():
     assert (few[0] != deploy.draws(cstr, 3, seed=2)[0]).all()
 
 
+@pytest.mark.parametrize("name, options", [("actor", {}), ("rl_mpc", dict(horizon=0)), ("rl_mpc", dict(horizon=2)), ("nominal_mpc", {}),
+                                           ("rl_mpc", dict(horizon=1, value="taylor")),
+                                           ("rl_mpc", dict(horizon=1, value="taylor-local"))])  # fmt: skip
+def test_a_new_goal_gives_what_a_new_controller_gives(name, options, checkpoint):
+    both = [deploy.build_controller(name, deploy.Args(critic=checkpoint, compile=False, goal=goal, **options)) for goal in ((0.5,), (0.8,))]
+    both[0].make_step(X0)
+    before = both[0].make_step(X0)
+    both[0].set_goal((0.8,))
+    both[0].reset()
+    np.testing.assert_allclose(both[0].make_step(X0), both[1].make_step(X0), rtol=1e-6)
+    assert name == "nominal_mpc" or np.abs(before - both[1].make_step(X0)).max() > 1e-3
+    for wrong in ((0.5, 0.5), (np.nan,)):
+        with pytest.raises(ValueError, match="goal"):
+            both[0].set_goal(wrong)
+
+
+def test_a_network_that_overflows_holds_the_last_action():
+    x, goal = ca.MX.sym("x", 4), ca.MX.sym("goal", 1)
+    actor = deploy.ActorController(cstr, ca.Function("mu", [x, goal], [ca.vertcat(20.0, -2000.0) * ca.sqrt(1e3 - x[0])]), GOAL)
+    first = actor.make_step(X0)
+    np.testing.assert_array_equal(actor.make_step([1e6, 0.5, 134.0, 130.0]), first)
+    assert actor.stats["rung"] == "hold" and not actor.stats["success"]
+    actor.make_step(X0)
+    assert actor.stats["rung"] == "solved"
+
+
 def test_horizon_zero_maximises_the_critic(checkpoint):
     mu, Q, _ = deploy.export(deploy.load_critic(checkpoint, "cstr", "min"))
     controller = deploy.GreedyController(cstr, mu, Q, GOAL)
@@ -396,6 +422,8 @@ def test_the_slack_weight_follows_the_critic(checkpoint, tmp_path):
         (["--combine", "max"], ["combine", "min"]),
         (["--value", "linear"], ["value", "taylor"]),
         (["--robust-horizon", "5"], ["--robust-horizon", "5", "leaves"]),
+        (["--horizon", "0", "--slack-weight", "3"], ["--slack-weight", "3", "no effect", "--horizon 0"]),
+        (["--horizon", "0", "--combine", "mean"], ["--combine", "mean", "no effect"]),
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(arguments, words, checkpoint):

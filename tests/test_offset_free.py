@@ -198,6 +198,20 @@ def test_the_disturbance_makes_the_nominal_model_right_and_the_gain_filters_it()
     np.testing.assert_allclose(estimators[1].mismatch, estimators[0].mismatch / 4)
 
 
+@pytest.mark.parametrize("kind", ["disturbance", "parameters"])
+def test_a_wrong_measurement_teaches_nothing(kind):
+    """Neither on its arrival nor as the state that the next transition starts from."""
+    psi, u, x, estimator = np.array([1.05, 0.9]), np.array([20.0, -2000.0]), NEAR, envs.Estimator(cstr, kind)
+    known = []
+    for wrong in (None, None, [1e6, 0.5, -1e9, 130.0], None):
+        seen = x if wrong is None else np.array(wrong)
+        estimator.update(seen)
+        known.append([*estimator.difference, *estimator.shift])
+        estimator.before, x = (seen, u), cstr.step(x, u, psi)
+    assert not np.any(known[0]) and np.any(known[1])
+    np.testing.assert_array_equal(known[1:], [known[1]] * 3)
+
+
 @pytest.mark.parametrize("name, estimate", [("nominal_mpc", "parameters"), ("nominal_mpc", "disturbance"), ("rl_mpc", "disturbance")])
 def test_no_offset_remains(name, estimate):
     """Near the goal, on a plant that the nominal model misses."""

@@ -302,6 +302,9 @@ def test_plant_data_from_the_command_line(tmp_path):
         (["--out", "README.md/runs"], ["--out", "cannot write"]),
         (["--scenarios", "all"], ["scenarios", "robust"]),
         (["--branches", "2", "--add-plant-data", "x.npz"], ["--branches", "2", "--add-plant-data"]),
+        (["--reward-tolerance", "0.1"], ["--reward-tolerance", "no effect"]),
+        (["--no-smooth-reward", "--reward-sigma2", "0.1"], ["--reward-sigma2", "no effect"]),
+        (["--her-ratio", "0", "--her-strategy", "final"], ["--her-strategy", "no effect"]),
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(arguments, words):
