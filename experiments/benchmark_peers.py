@@ -90,7 +90,7 @@ def load_critic(kind, seed):
             for p in [*critic.actor.parameters(), *critic.critic.parameters()]:
                 bound = p.shape[-2] ** -0.5 if p.dim() > 1 else 0.1
                 p.copy_(bound * (2 * torch.rand(p.shape, generator=generator, dtype=p.dtype) - 1))
-    actor, twins = deploy.layers(critic)
+    actor, twins = critic.layers()
     weights = {name: critic.scaling[name] for name in ("x_center", "x_scale", "error_scale", "goal_index")}
     for name, layers in (("actor", actor), ("critic", twins[0])):
         for i, (w, b) in enumerate(layers):
