@@ -49,7 +49,7 @@ from envs.tools.expansion import Expansion, TaylorValue, with_derivatives
 from envs.tools.figure import draw_episode
 
 # arguments that results.csv has columns for, or that change no result
-ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "steps", "jobs", "controllers", "compile", "out"}
+ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
 MAX_CHECKPOINT_BYTES = 10**9
 METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 DEFAULT_CONTROLLERS = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
@@ -100,8 +100,8 @@ class Args:
     controllers: tuple[Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"], ...] = DEFAULT_CONTROLLERS
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
-    """translate the optimal control problems to C and compile them, once per problem and critic (kept in ~/.cache/rlmpc); linear plants are
-    never compiled, since matrix products gain nothing"""
+    """translate the optimal control problems to C and compile them, once per problem and critic (kept in $XDG_CACHE_HOME/rlmpc, or
+    ~/.cache/rlmpc); linear plants are never compiled, since matrix products gain nothing"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__rl_mpc_deploy__{seed}__{time}"""
 

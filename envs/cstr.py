@@ -2,7 +2,7 @@
 
 A -> B -> C and 2A -> D. The feed rate F and the cooling power Q_dot steer the product concentration c_B; the activation energy
 of A -> D (factor alpha) and the rate of A -> B (factor beta) are uncertain. Corrections to the printed equations: the T_R
-equation lacks a `+` before the heat-transfer term, and Table 1's activation energies already are kelvin (divided by R).
+equation lacks a `+` before the heat-transfer term, and Table 1 lists activation energies times R, where the exponents need kelvin.
 """
 
 import numpy as np

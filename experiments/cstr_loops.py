@@ -147,7 +147,8 @@ def train(agents, args):
 
     def one(agent):
         seed, *flags = map(str, agent)
-        version = hashlib.sha256(b"".join(path.read_bytes() for path in code) + repr((flags, args.quick)).encode()).hexdigest()[:8]
+        named = [flag.name if isinstance(flag, Path) else str(flag) for flag in agent[1:]]  # the same wherever the files lie
+        version = hashlib.sha256(b"".join(path.read_bytes() for path in code) + repr((named, args.quick)).encode()).hexdigest()[:8]
         final = args.runs / f"agents/{version}_{seed}"
         if not (final / "checkpoint.pt").exists():
             command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--seed", seed, "--eval-every", "0", "--save-every", "0"]
