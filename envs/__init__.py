@@ -12,12 +12,13 @@ A plant module holds plain constants and functions and no gymnasium code (`envs/
     U_LOW, U_HIGH                                 actuator limits, (n_u,)
     PSI_NAMES, PSI_NOMINAL, EVAL_PSI              uncertain parameters, their nominal value, the plants of the evaluation
     SCENARIOS                                     sets to draw psi from: "nominal", "mpc" (its first is nominal), "robust" (training)
-    BENCHMARK                                     of the MPC that rl_mpc_deploy.py compares with: "horizon", "slack_price" (2, n_x) below and
-                                                  above (inf: a hard bound, 0: none), "change_weight" (n_u,)
+    BENCHMARK                                     of the MPC that rl_mpc_deploy.py compares with: "horizon", "slack_price" (2, n_x), below
+                                                  and above (inf: a hard bound, 0: none), "change_weight" (n_u,)
     GOAL_INDEX                                    which states the goal is about, so `x[..., GOAL_INDEX]` is the achieved goal
     TRAIN_GOALS, EVAL_GOAL, GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE (box of the goals that can be held at steady state)
     ERROR_SCALE                                   size of a large goal error, (n_goal,): normalises the networks' input
-    REWARD_SIGMA2, MPC_SIGMA2                     sigma^2 of the Gaussian reward and of the planners' stage cost, squared units of the goal error
+    REWARD_SIGMA2, MPC_SIGMA2                     sigma^2 of the Gaussian reward and of the planners' stage cost, squared units of the
+                                                  goal error
     REWARD_TOLERANCE                              half-width of the sparse reward, units of the goal error
     ode(x, u, psi, xp), step(x, u, psi), goal_error(achieved, goal, xp), percentage_error(achieved, goal)
     MODEL_SUBSTEPS                                Runge-Kutta steps per sampling time in predictions
