@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -39,7 +40,10 @@ def check(args, table, **ranges):
 
 
 def run(main, args):
-    """`main(args)`; Ctrl-C ends it without a traceback."""
+    """`main(args)`; a --quick run without --out leaves the committed results alone, and Ctrl-C ends a run without a traceback."""
+    if args.quick and args.out is not None and args.out.resolve() == Path(__file__).resolve().parent:
+        args = replace(args, out=Path("runs/quick"))
+        print(f"--quick: results go to {args.out}; --out names another folder", file=sys.stderr)
     try:
         main(args)
     except KeyboardInterrupt:

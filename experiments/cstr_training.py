@@ -126,6 +126,7 @@ def plot(args):
 
 
 def main(args):
+    cells.check(args, "cstr_training.csv", seeds=(1, 1000), jobs=(1, 1024))
     if args.quick:
         args.seeds = min(args.seeds, 2)
     if not args.plot_only:
@@ -134,4 +135,4 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

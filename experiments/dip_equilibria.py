@@ -17,6 +17,8 @@ import tyro
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
+import cells
+
 import goal_mpc as gm
 from envs import double_pendulum as plant
 from envs.tools.figure import draw_episode
@@ -85,10 +87,14 @@ def plot(args):
 
 
 def main(args):
+    cells.check(args, "dip_profile.csv", episodes=(1, 1000), seed=(0, 10**9), hold=(1, 10**5))
+    for name in args.goals:
+        if name not in plant.GOALS:
+            cells.fail(f"--goals {name} is not an equilibrium; choose from {', '.join(plant.GOALS)}")
     if not args.plot_only:
         collect(args)
     plot(args)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -7,17 +7,13 @@ The first guess is the start state held, as in the authors' scripts, or (guide 7
 N = 75. Writes results/dip_performance.csv (a row per controller and start, columns of goal_mpc.py) and figures/dip_performance.png.
 """
 
-import hashlib
-import signal
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -56,33 +52,26 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def run_cell(settings, path):
-    """One controller from every start; rows of results.csv with the guide's horizon, into `path`."""
+def run_cell(settings):
+    """One controller from every start; rows of results.csv with the guide's horizon."""
     mpc, goals, rows = gm.build_controller(settings), np.zeros((settings.steps, 2)), []
     for seed in range(settings.seed, settings.seed + settings.episodes):
         x0, psi = gm.start_and_plant(double_pendulum, seed, random_plant=False)
         x, u, _, log = gm.simulate(mpc, x0, psi, goals)
         head = {"env": settings.env, "objective": settings.objective, "horizon": settings.horizon, "guide_horizon": settings.guide_horizon}
         rows.append(head | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)} | gm.summary(double_pendulum, x, u, goals, log))
-    gm.write_csv(rows, path)
+    return rows
 
 
 def collect(args):
-    paths = []
-    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
-    with ProcessPoolExecutor(args.jobs, **quit_at_once) as pool:
-        futures = []
-        for objective, horizon, guide in CELLS:
-            settings = gm.Args(objective=objective, horizon=horizon, guide_horizon=guide, episodes=args.episodes, seed=args.seed)
-            if args.quick:
-                settings = gm.replace(settings, horizon=horizon // 25, guide_horizon=guide // 25, episodes=2, steps=5, compile=False)
-            inputs = b"".join(Path(module.__file__).read_bytes() for module in (gm, gm.envs, double_pendulum))
-            paths.append(args.runs / f"{hashlib.sha256(repr(settings).encode() + inputs).hexdigest()[:12]}.csv")
-            if not paths[-1].exists():
-                futures.append(pool.submit(run_cell, settings, paths[-1]))
-        for future in tqdm(futures, unit="cell", disable=None):
-            future.result()
-    gm.write_csv([row for path in paths for row in cells.read(path)], args.out / "results/dip_performance.csv")
+    work = []
+    for objective, horizon, guide in CELLS:
+        settings = gm.Args(objective=objective, horizon=horizon, guide_horizon=guide, episodes=args.episodes, seed=args.seed)
+        if args.quick:
+            settings = gm.replace(settings, horizon=horizon // 25, guide_horizon=guide // 25, episodes=2, steps=5, compile=False)
+        work.append(settings)
+    inputs = [__file__, gm.__file__, gm.envs.__file__, double_pendulum.__file__]
+    cells.write(cells.collect(run_cell, work, args.jobs, args.runs, inputs), args.out / "results/dip_performance.csv")
 
 
 def plot(args):
@@ -126,10 +115,11 @@ def plot(args):
 
 
 def main(args):
+    cells.check(args, "dip_performance.csv", episodes=(1, 1000), seed=(0, 10**9), jobs=(1, 1024))
     if not args.plot_only:
         collect(args)
     plot(args)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    cells.run(main, tyro.cli(Args, description=__doc__))

@@ -74,7 +74,7 @@ RUNGS = ("solved", "retry", "plan", "actor", "hold")  # of the failure ladder
 TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")  # columns that may differ from run to run
 
 
-@dataclass(frozen=True)
+@dataclass
 class Args:
     study: Literal["controllers", "training", "checkpoints", "deployments", "determinism"] = "controllers"
     """what to break"""

@@ -87,7 +87,7 @@ STEPS = [
     experiment("reliability", "checkpoints", 2),
     experiment("reliability", "deployments", 15, CRITICS, alone=True),
     experiment("reliability", "determinism", 10, CRITICS, alone=True),
-    experiment("dip_performance", minutes=90, alone=True),
+    experiment("dip_performance", minutes=30, alone=True),
     experiment("linear_value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
     experiment("linear_value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
     experiment("solve_time", minutes=10, needs=CRITICS, alone=True),
