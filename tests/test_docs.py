@@ -58,9 +58,9 @@ def test_every_command_of_the_three_scripts_runs(script, words, checkpoint, tmp_
     if module is sac_her_branching:
         few = dict(total_timesteps=640, learning_starts=320, num_envs=32, eval_episodes=4, buffer_size=3200)
     elif module is rl_mpc_deploy:
-        few = dict(episodes=1, steps=2, jobs=1)
+        few = dict(episodes=1, steps=2, jobs=1, compile=False)  # compiled, they run in test_the_worked_example
     else:
-        few = dict(steps=min(args.steps, 6), animate=False)
+        few = dict(steps=min(args.steps, 6), animate=False, compile=False)
     module.main(replace(args, **few, out=tmp_path))
     assert list(tmp_path.rglob("*.csv"))
 
