@@ -230,47 +230,47 @@ def equal(a, b):
 
 
 def killed(cell):
-    """A training killed at random moments, and what is left each time; compared with one that was not."""
+    """Trainings killed at random moments, until so many kills have come about; each end is compared with that of one that was not."""
     branches, kills, seed = cell
-    rng, landed, half, mid_write = np.random.default_rng(seed), 0, 0, 0
+    rng, counts = np.random.default_rng(seed), collections.Counter({key: 0 for key in ("kills", "half", "mid_write", "ends", "same")})
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
-        start = [*TRAINING, "--branches", branches, "--seed", seed, "--out"]
+        start, runs = [*TRAINING, "--branches", branches, "--seed", seed, "--out"], folder / "killed"
         tick = time.perf_counter()
         train(*start, folder / "whole")
         seconds = time.perf_counter() - tick
-        finished = False
-        while not finished:
-            runs = list((folder / "killed").glob("*/resume.pt"))
-            arguments = ["--resume", runs[0]] if runs else [*start, folder / "killed"]
-            finished = train(*arguments, kill_after=rng.uniform(0.25, 0.6) * seconds if landed < kills else None)
-            landed += not finished
-            found = [path for name in ("resume.pt", "checkpoint.pt") for path in (folder / "killed").glob(f"*/{name}")]
-            mid_write += any((folder / "killed").glob("*/*.tmp"))
-            for path in found:
-                try:
-                    torch.load(path, weights_only=True)
-                except Exception:
-                    half += 1
-            if not runs and not found:  # killed before it had saved anything
-                shutil.rmtree(folder / "killed", ignore_errors=True)
-        whole, resumed = (next((folder / name).glob("*/resume.pt")).parent for name in ("whole", "killed"))
-        same = all(
-            equal(*(torch.load(run / name, weights_only=True) for run in (whole, resumed))) for name in ("resume.pt", "checkpoint.pt")
-        )
-        same = same and without_times(whole / "evaluations.csv") == without_times(resumed / "evaluations.csv")
-    return [{"branches": branches, "kills": landed, "half": half, "mid_write": mid_write, "same": same}]
+        while counts["kills"] < kills:
+            shutil.rmtree(runs, ignore_errors=True)
+            finished = False
+            while not finished:
+                saved = list(runs.glob("*/resume.pt"))
+                arguments = ["--resume", saved[0]] if saved else [*start, runs]
+                finished = train(*arguments, kill_after=rng.uniform(0.3, 0.9) * seconds if counts["kills"] < kills else None)
+                if not finished:
+                    counts.update(kills=1, mid_write=int(any(runs.glob("*/*.tmp"))), half=int(not all(map(whole, runs.glob("*/*.pt")))))
+            ends = [next(place.glob("*/resume.pt")).parent for place in (folder / "whole", runs)]
+            same = all(equal(*(torch.load(end / name, weights_only=True) for end in ends)) for name in ("resume.pt", "checkpoint.pt"))
+            tables = [without_times(end / "evaluations.csv") for end in ends]
+            counts.update(ends=1, same=int(same and tables[0] == tables[1]))
+    return [{"branches": branches} | dict(counts)]
+
+
+def whole(path):
+    """Whether a file can be read."""
+    try:
+        torch.load(path, weights_only=True)
+    except Exception:
+        return False
+    return True
 
 
 def training(args):
-    kills = 1 if args.quick else 12
-    parts = [(branches, kills, seed) for seed in range(1 if args.quick else 2) for branches in (1, 4)]
+    parts = [(branches, 1 if args.quick else 30, seed) for seed, branches in enumerate((1, 4))]
     inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(sac.__file__)]
     found = cells.collect(killed, parts, args.jobs, args.runs, inputs)
-    kills, half, mid_write = (sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write"))
-    same = sum(row["same"] == "True" for row in found)
+    kills, half, mid_write, ends, same = (sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write", "ends", "same"))
     return [result("training", "SIGKILL: what was saved is whole", kills, kills - half, f"{mid_write} of them while a file was written"),
-            result("training", "killed again and again and resumed: equal to an uninterrupted run", len(found), same)]  # fmt: skip
+            result("training", "killed and resumed: equal to an uninterrupted run", ends, same)]  # fmt: skip
 
 
 def result(study, case, trials, held, detail=""):
