@@ -24,6 +24,7 @@ episode.gif. Only the folder `envs/` is needed beside this file.
 import csv
 import signal
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -652,12 +653,12 @@ def check(args):
 
 def main(args):
     plant, goals = check(args)
-    out = args.out or Path("runs") / f"{args.env}__goal_mpc__{args.seed}__{int(time.time())}"
     try:
+        out = args.out or envs.new_folder(Path("runs") / f"{args.env}__goal_mpc__{args.seed}__{int(time.time())}")
         out.mkdir(parents=True, exist_ok=True)
-        (out / "results.csv").touch()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
-        fail(f"--out {out}: cannot write there ({error.strerror})")
+        fail(f"--out {args.out or 'runs'}: cannot write there ({error.strerror})")
     tick = time.perf_counter()
     mpc = build_controller(args)
     print(f"{plant.ENV_ID}: {mpc.size['w']} variables, {mpc.size['g']} constraints, built in {time.perf_counter() - tick:.1f} s")
@@ -677,7 +678,7 @@ def main(args):
     if args.animate:
         plant.animate(*episodes[0], goals, out / "episode.gif")
     print(table(rows))
-    print(", ".join(str(path) for path in sorted(out.iterdir())))
+    print(f"{out}/results.csv, trajectories.npz, episode.png" + ", episode.gif" * args.animate)
     return rows
 
 

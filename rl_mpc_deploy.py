@@ -26,6 +26,7 @@ import json
 import multiprocessing
 import signal
 import sys
+import tempfile
 import time
 import zipfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -692,7 +693,7 @@ def build_controller(name, args):
     plant = critic.plant
     compile = args.compile and not hasattr(plant, "next_state")
     mu, Q, V = export(critic)
-    goal = plant.EVAL_GOAL if args.goal is None else np.array(args.goal, dtype=float)
+    goal = envs.checked_goal(plant, plant.EVAL_GOAL if args.goal is None else args.goal)
     observed = "mismatch" if critic.mismatch_scale else None
     estimators = [envs.Estimator(plant, kind, args.filter_gain, critic.mismatch_scale)
                   for kind in (observed, args.estimate if args.offset_free else observed)]  # fmt: skip
@@ -748,7 +749,7 @@ def combine(args):
 
 def critic_path(args):
     shipped = [Path(__file__).parent / f"experiments/pretrained/{args.env}_{kind}.pt" for kind in ("constrained", "robust")]
-    return args.critic or (shipped[0] if shipped[0].exists() else shipped[1])
+    return args.critic or next((path for path in shipped if path.exists()), shipped[0])
 
 
 # Closed loop
@@ -931,18 +932,19 @@ def check(args):
 
 def main(args):
     plant, goal, critic = check(args)
-    out = args.out or Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}"
     try:
+        out = args.out or envs.new_folder(Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
         out.mkdir(parents=True, exist_ok=True)
-        (out / "results.csv").touch()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
-        fail(f"--out {out}: cannot write there ({error.strerror})")
+        fail(f"--out {args.out or 'runs'}: cannot write there ({error.strerror})")
     try:
         difference = check_export(critic, export(critic)[2])
     except RuntimeError as error:
         fail(error)
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}")
-    if args.compile and not hasattr(plant, "next_state"):
+    planners = set(args.controllers) - {"actor"} - ({"rl_mpc"} if args.horizon == 0 else set())
+    if args.compile and planners and not hasattr(plant, "next_state"):
         print("building the controllers; new ones are compiled, which takes half a minute", flush=True)
     tick = time.perf_counter()
     rows, paths = compare(args)
@@ -960,4 +962,5 @@ if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
     except KeyboardInterrupt:
+        print("interrupted; a comparison writes its results at its end", file=sys.stderr)
         raise SystemExit(130) from None

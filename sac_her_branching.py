@@ -527,7 +527,7 @@ def checkpoint(agent, args, step):
         "gamma": args["gamma"],
         "alpha": agent.log_alpha.exp().item(),
         "step": step,
-        "args": args,
+        "args": {name: value for name, value in args.items() if name not in ("out", "resume")},
     }
 
 
@@ -553,7 +553,9 @@ def check(args):
     except ValueError as error:
         fail(error)
     ranges = {
-        (1, 10**9): ("total_timesteps", "num_envs", "branches", "torch_threads", "batch_size", "steps_per_update", "eval_episodes"),
+        (1, 10**9): ("total_timesteps", "steps_per_update"),
+        (1, 10**6): ("num_envs", "batch_size", "eval_episodes"),  # what memory bears
+        (1, 1024): ("branches", "torch_threads"),
         (0, 10**9): ("seed", "learning_starts", "eval_every", "save_every", "constraint_weight"),
         (0, 1): ("her_ratio", "gamma", "tau", "learning_rate_end"),
         (1e-9, 1e3): ("learning_rate", "reward_sigma2", "reward_tolerance", "alpha_init"),
@@ -631,15 +633,14 @@ def main(args):
         args, state = load_resume(args.resume)
     plant = check(args)
     plant_data = load_plant_data(args.add_plant_data, plant) if args.add_plant_data and not state else None
-    run_dir = run_dir or args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
     device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
     if state and state["device"] != device.type:
         fail(f"--resume {run_dir / 'resume.pt'} was written on {state['device']}; its random state cannot continue on {device.type}")
     try:
-        run_dir.mkdir(parents=True, exist_ok=state is not None)
+        run_dir = run_dir or envs.new_folder(args.out / f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}")
         writer = SummaryWriter(run_dir, purge_step=state["step"] + 1 if state else None)
     except OSError as error:
-        fail(f"{'--resume' if state else '--out'}: cannot write {run_dir} ({error.strerror})")
+        fail(f"{'--resume' if state else '--out'}: cannot write {run_dir or args.out} ({error.strerror})")
     torch.set_num_threads(args.torch_threads)
     plain_args = plain(args)
     writer.add_text("hyperparameters", "|argument|value|\n|-|-|\n" + "\n".join(f"|{k}|{v}|" for k, v in plain_args.items()))

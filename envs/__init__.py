@@ -37,6 +37,7 @@ The folder `tools` holds what the scripts share beside plants.
 
 import importlib
 import inspect
+import itertools
 import pkgutil
 
 import gymnasium as gym
@@ -204,6 +205,18 @@ def outside_constraints(plant, x, sigma2=0.01, xp=np):
     """The paper's measure of constraint violation, exp(-|x - clip(x)|^2 / (2 sigma2)) - 1, x (..., n_x) -> (...): 0 inside the box."""
     low, high = (xp.asarray(bound, dtype=x.dtype, device=x.device) for bound in (plant.X_LOW, plant.X_HIGH))
     return xp.exp(-((x - xp.clip(x, low, high)) ** 2).sum(-1) / (2 * sigma2)) - 1
+
+
+def new_folder(path):
+    """Make the folder, or if another run has it already one with -2, -3, ... behind its name; returns the path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            pass
 
 
 def can_hold(plant, goals):

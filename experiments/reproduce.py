@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import joblib
 import tyro
 from tqdm import tqdm
 
@@ -30,6 +29,11 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 sys.path.insert(0, str(HERE))
 import cells
+
+try:
+    import joblib
+except ModuleNotFoundError:
+    cells.fail("joblib is missing; pip install -r requirements-experiments.txt")
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ NOTHING_KEPT = {"dip_equilibria", "cstr_profile", "solve_time"}  # take no --run
 class Args:
     quick: bool = False
     """tiny budgets: a smoke test of everything"""
-    only: tuple[str, ...] = ()
+    only: tuple[str, ...] | None = None
     """steps to run, with what they need; default: all"""
     list: bool = False
     """print the steps, what they need and whether they are done"""
@@ -175,7 +179,10 @@ def run(step, args):
 
 def wanted(steps, only):
     """The steps named and what they need, in order. Raises ValueError for a name that is none."""
-    by_name, chosen, names = {step.name: step for step in steps}, set(), list(only or (step.name for step in steps))
+    by_name, chosen = {step.name: step for step in steps}, set()
+    names = list(by_name if only is None else only)
+    if not names:
+        raise ValueError(f"--only is empty; choose from {', '.join(by_name)}")
     while names:
         name = names.pop()
         if name not in by_name:
@@ -218,7 +225,11 @@ def main(args, steps=STEPS):
     if args.list:
         for step in steps:
             state = "done" if note(step, args).exists() else f"{step.minutes:g} min"
-            print(f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else ''}{'needs ' + ', '.join(step.needs) if step.needs else ''}")
+            needs = "the reactor's critics" if step.needs == CRITICS else ", ".join(step.needs)
+            print(f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else '':7s}{'needs ' + needs if needs else ''}")
+        left = [step for step in steps if not note(step, args).exists()]
+        hours = sum(step.minutes / (1 if step.alone else args.jobs) for step in left) / 60
+        print(f"minutes of one process; about {hours:.1f} hours are left with --jobs {args.jobs}")
         return
     settings = dict(backend="loky", n_jobs=args.jobs)
     if args.backend == "dask":

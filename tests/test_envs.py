@@ -149,6 +149,11 @@ def test_vector_env_state_continues_exactly():
     np.testing.assert_array_equal([vec.step(action)[0]["observation"] for _ in range(60)], expected)
 
 
+def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path):
+    made = [envs.new_folder(tmp_path / "runs/cstr__0__1") for _ in range(3)]
+    assert [path.name for path in made] == ["cstr__0__1", "cstr__0__1-2", "cstr__0__1-3"] and all(path.is_dir() for path in made)
+
+
 def test_unknown_names_are_refused_with_the_list():
     with pytest.raises(ValueError, match="cstr"):
         envs.load("no_such_plant")

@@ -101,7 +101,14 @@ def test_a_lost_worker_loses_no_result_and_doubles_none(settings):
 def test_the_command_line(settings, capsys):
     reproduce.main(reproduce.Args(list=True, only=("cstr_frontier",), runs=settings.runs, out=settings.out))
     assert "needs cstr_oracle" in capsys.readouterr().out
-    bad = dict(only=("nothing",)), dict(jobs=0), dict(quick=True, out=reproduce.HERE), dict(backend="dask"), dict(scheduler="tcp://x:1")
+    bad = (
+        dict(only=("nothing",)),
+        dict(only=()),
+        dict(jobs=0),
+        dict(quick=True, out=reproduce.HERE),
+        dict(backend="dask"),
+        dict(scheduler="tcp://x:1"),
+    )
     for options in bad:
         with pytest.raises(SystemExit):
             reproduce.main(reproduce.Args(**dict(runs=settings.runs, out=settings.out) | options))
