@@ -375,7 +375,7 @@ def test_command_line_end_to_end_and_any_number_of_jobs(checkpoint, tmp_path):
         assert {p.name for p in (tmp_path / str(jobs)).iterdir()} == {"results.csv", "trajectories.npz", "episode.png"}
         rows = list(csv.DictReader(open(tmp_path / str(jobs) / "results.csv")))
         assert list(rows[0]) == COLUMNS and len(rows) == 9
-        assert len(json.loads(rows[0]["psi"])) == 2 and json.loads(rows[0]["arguments"]) == {}
+        assert len(json.loads(rows[0]["psi"])) == 2 and json.loads(rows[0]["arguments"]) == {"steps": 3}
         assert all(np.isfinite(float(row[column])) for row in rows for column in COLUMNS[9:])
         tables.append([{k: v for k, v in row.items() if not k.startswith("solve_ms")} for row in rows])
     assert tables[0] == tables[1]

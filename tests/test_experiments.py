@@ -38,6 +38,8 @@ TEXT = {
     "axis",
     "part",
     "barrier",
+    "study",
+    "detail",
     "peer",
     "ours_status",
     "peer_status",
