@@ -669,6 +669,8 @@ def main(args):
             returns = np.array(returns)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             fail(f"--resume {run_dir / 'resume.pt'}: its state does not fit its arguments ({type(error).__name__})")
+        if step >= args.total_timesteps:
+            print(f"notice: {run_dir} had finished already", file=sys.stderr)
 
     def save_all():
         save(checkpoint(agent, plain_args, step), run_dir / "checkpoint.pt")
