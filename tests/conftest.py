@@ -32,11 +32,28 @@ def checkpoint(tmp_path_factory, plant):
     return path
 
 
-@pytest.fixture(scope="session")
-def quick(tmp_path_factory):
-    """The whole reproduction on tiny budgets: a folder with results/, figures/, pretrained/ and runs/."""
+def pytest_collection_modifyitems(items):
+    """What looks at the whole reproduction comes last: it runs beside the other tests from the start."""
+    items.sort(key=lambda item: "quick" in getattr(item, "fixturenames", ()))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def reproduction(request, tmp_path_factory):
+    """The process of the whole reproduction on tiny budgets, and its folder, if any test looks at it."""
+    if not any("quick" in getattr(item, "fixturenames", ()) for item in request.session.items):
+        yield None
+        return
     folder = tmp_path_factory.mktemp("quick")
     command = [sys.executable, "experiments/reproduce.py", "--quick", "--out", folder, "--runs", folder / "runs"]
-    out = subprocess.run(command, cwd=Path(__file__).parent.parent, capture_output=True, text=True, timeout=1200)
-    assert out.returncode == 0, out.stderr
+    with open(folder / "log.txt", "w") as log:
+        process = subprocess.Popen(command, cwd=Path(__file__).parent.parent, stdout=log, stderr=subprocess.STDOUT)
+    yield process, folder
+    process.terminate()
+
+
+@pytest.fixture(scope="session")
+def quick(reproduction):
+    """What the whole reproduction on tiny budgets wrote: a folder with results/, figures/, pretrained/ and runs/."""
+    process, folder = reproduction
+    assert process.wait(timeout=1200) == 0, (folder / "log.txt").read_text()
     return folder

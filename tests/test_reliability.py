@@ -49,7 +49,7 @@ def arguments(module):
 
 
 @pytest.mark.parametrize("module", SCRIPTS, ids=lambda module: module.__name__)
-@settings(max_examples=1_000, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=500, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_any_command_line_is_accepted_or_refused_in_one_sentence(module, data, capsys):
     line = data.draw(arguments(module))
