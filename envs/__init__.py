@@ -229,8 +229,8 @@ def can_hold(plant, goals):
 
 
 def checked_state(plant, x0):
-    """The measured state as a float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
-    x0 = np.asarray(x0, dtype=float)
+    """The measured state as a new float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
+    x0 = np.array(x0, dtype=float)
     if x0.shape != plant.X_LOW.shape:
         raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
     if not np.isfinite(x0).all():
@@ -238,11 +238,19 @@ def checked_state(plant, x0):
     return x0
 
 
-def checked_goal(plant, goal):
-    """The goal as a float array (n_goal,). Raises ValueError if it has another shape or an entry that is not finite."""
-    goal = np.array(goal, dtype=float)
-    if goal.shape != (len(plant.GOAL_INDEX),) or not np.isfinite(goal).all():
-        raise ValueError(f"goal is {goal}; {plant.ENV_ID} needs ({len(plant.GOAL_INDEX)},) finite numbers")
+def checked_goal(plant, goal, horizon=None):
+    """The goal as a new float array: (n_goal,) from that many numbers, or from one if there is one; with a horizon also (n_goal, horizon).
+
+    Raises ValueError for another shape, or an entry outside the plant's range or not finite.
+    """
+    n, goal = len(plant.GOAL_INDEX), np.array(goal, dtype=float)
+    goal = goal.reshape(1) if goal.ndim == 0 and n == 1 else goal
+    if goal.shape not in ((n,), (n, horizon)):
+        raise ValueError(f"goal is {goal}; {plant.ENV_ID} needs {n} number(s){f', or {n} for each of {horizon} stages' if horizon else ''}")
+    low, high = plant.GOAL_LOW, plant.GOAL_HIGH
+    if not ((low <= goal.T) & (goal.T <= high)).all():  # nor is nan
+        raise ValueError(f"goal is {goal}; {plant.ENV_ID} takes {np.array2string(low, threshold=4, edgeitems=1)} to "
+                         f"{np.array2string(high, threshold=4, edgeitems=1)}")  # fmt: skip
     return goal
 
 

@@ -1,4 +1,4 @@
-"""Optimal control problems translated to C by CasADi, and compiled."""
+"""C code, written by hand or translated from CasADi, compiled and kept."""
 
 import contextlib
 import hashlib
@@ -12,8 +12,10 @@ import tempfile
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 
-COMPILER_FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-fPIC")
+WHEEL = Path(ca.__file__).parent  # CasADi's libraries, HPIPM among them, and their headers
 
 
 def vectorised(source):
@@ -30,34 +32,87 @@ def vectorised(source):
     return head + product + rest if start >= 0 else source
 
 
+def compiled(source, *flags, link=("-lm",)):
+    """Path of the shared library made of C code.
+
+    It is kept in a cache folder under a hash of source, flags, compiler and processor, and appears there by an atomic rename, so that
+    parallel processes may race for it. Raises OSError (no compiler, no place to write) or subprocess.CalledProcessError.
+    """
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
+    if compiler is None:
+        raise OSError("no gcc, clang or cc")
+    version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
+    info = Path("/proc/cpuinfo")
+    processor = re.search(r"^(flags|Features)\s*:.*", info.read_text(), re.MULTILINE) if info.exists() else None
+    processor = processor[0] if processor else platform.processor()
+    key = hashlib.sha256(source.encode() + version + f"{FLAGS} {flags} {link} {processor}".encode()).hexdigest()[:32]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
+    library = cache / f"{key}.so"
+    if not library.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as folder:  # linked apart: fast-math, linked in, would change the whole process
+            (Path(folder) / "source.c").write_text(source)
+            run = lambda *command: subprocess.run([compiler, *command], check=True, capture_output=True, cwd=folder)  # noqa: E731
+            run(*FLAGS, *flags, "-c", "source.c")
+            run("-shared", "source.o", "-o", "library.so", *link)
+            os.replace(Path(folder) / "library.so", library)
+    return library
+
+
+def _notice(error):
+    print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
+
+
 def compiled_solver(plugin, nlp, options):
     """`options(name) -> nlpsol options` for the names "cold" and "warm" turned into two solvers on compiled functions, or None.
 
-    The C code of the problem and its derivatives is compiled once and kept in a cache folder under a hash of source, compiler
-    and processor; it appears there by an atomic rename, so that parallel processes may race for it. Where anything of that
-    fails (no compiler, no place to write, a library that does not load), a notice is printed and None returned.
+    Where the problem cannot be compiled, a notice is printed and None returned.
     """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
     try:
-        if compiler is None:
-            raise OSError("no gcc, clang or cc")
-        version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
-        cpu = Path("/proc/cpuinfo")
-        flags = re.search(r"^(flags|Features)\s*:.*", cpu.read_text(), re.MULTILINE) if cpu.exists() else None
-        processor = flags[0] if flags else platform.processor()
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
             ca.nlpsol("nlp", plugin, nlp, options("cold")).generate_dependencies("nlp.c")
-            source = vectorised(Path("nlp.c").read_text()).encode()
-            Path("nlp.c").write_bytes(source)
-            key = hashlib.sha256(source + version + f"{COMPILER_FLAGS} {processor}".encode()).hexdigest()[:32]
-            library = cache / f"{key}.so"
-            if not library.exists():
-                cache.mkdir(parents=True, exist_ok=True)
-                built = cache / f"{key}.{os.getpid()}"
-                subprocess.run([compiler, *COMPILER_FLAGS, "nlp.c", "-o", str(built), "-lm"], check=True, capture_output=True)
-                os.replace(built, library)
+            library = compiled(vectorised(Path("nlp.c").read_text()))
         return {name: ca.nlpsol(name, plugin, str(library), options(name)) for name in ("cold", "warm")}
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-        print(f"notice: running interpreted, several times slower ({error})", file=sys.stderr)
+        _notice(error)
         return None
+
+
+def compiled_functions(functions):
+    """CasADi functions as compiled ones, in order, or as they are where they cannot be compiled, with a notice.
+
+    -ffast-math makes them twice as fast: whether a result is finite must be asked outside.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            code = ca.CodeGenerator("functions.c")
+            for function in functions:
+                code.add(function)
+            code.generate()
+            library = compiled(vectorised(Path("functions.c").read_text()), "-ffast-math")
+        return [ca.external(function.name(), str(library)) for function in functions]
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        _notice(error)
+        return functions
+
+
+class OnArrays:
+    """A CasADi function on numpy arrays, a few microseconds a call: `f(*arrays) -> list of arrays`.
+
+    An argument or result that is (n, columns) in CasADi is an array (columns, n): a row per node. The next call overwrites the results.
+    """
+
+    def __init__(self, function):
+        self.arguments = [np.zeros(function.size_in(i)[::-1]) for i in range(function.n_in())]
+        self.results = [np.zeros(function.size_out(i)[::-1]) for i in range(function.n_out())]
+        self.buffer, self.evaluate = function.buffer()
+        for i, value in enumerate(self.arguments):
+            self.buffer.set_arg(i, memoryview(value.reshape(-1)))
+        for i, value in enumerate(self.results):
+            self.buffer.set_res(i, memoryview(value.reshape(-1)))
+
+    def __call__(self, *arguments):
+        for kept, value in zip(self.arguments, arguments, strict=True):
+            kept[...] = value
+        self.evaluate()
+        return self.results

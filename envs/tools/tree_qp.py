@@ -1,0 +1,154 @@
+"""A scenario tree and its quadratic program (tree_qp.c says which), by HPIPM from the CasADi wheel or by a solver of CasADi's `conic`."""
+
+import ctypes
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from envs.tools.compiled import WHEEL, compiled
+
+TOLERANCE, MOST_ITERATIONS = 1e-9, 60
+RIDGE = 1e-8  # on du, that of tree_qp.c
+MAX_NODES = 20_000
+
+
+class ScenarioTree:
+    """Nodes of a tree over S scenarios that branches at the first `robust_horizon` stages, numbered stage by stage.
+
+    nodes: how many per stage 0 ... horizon; first: the number of each stage's first node; inner: how many have children.
+    stage, parent (of the root: -1), scenario (on the way from the parent): of every node. later: which node's action each node with
+    children takes over one sampling time later, under the first scenario where the tree branches; in the last stage its own.
+    """
+
+    def __init__(self, scenarios, horizon, robust_horizon):
+        if horizon < 1 or robust_horizon < 0:
+            raise ValueError(f"horizon is {horizon}, robust_horizon {robust_horizon}; they must be at least 1 and 0")
+        leaves = scenarios ** min(robust_horizon, horizon)
+        if leaves * horizon > MAX_NODES:
+            raise ValueError(f"robust_horizon {robust_horizon} gives a tree of {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
+        self.nodes = [scenarios ** min(t, robust_horizon) for t in range(horizon + 1)]
+        self.first = np.cumsum([0, *self.nodes])
+        self.inner = int(self.first[horizon])
+        self.stage = np.repeat(np.arange(horizon + 1), self.nodes)
+        self.parent, self.scenario = np.full(len(self.stage), -1), np.zeros(len(self.stage), dtype=int)
+        self.history = np.full((len(self.stage), max(robust_horizon, 1)), scenarios)  # at each branching; S where none yet
+        for node in range(1, len(self.stage)):
+            t, order = self.stage[node], node - self.first[self.stage[node]]
+            branching = t <= robust_horizon
+            self.parent[node] = self.first[t - 1] + (order // scenarios if branching else order)
+            self.history[node] = self.history[self.parent[node]]
+            self.scenario[node] = order % scenarios
+            if branching:
+                self.history[node, t - 1] = self.scenario[node]
+        self.later = np.arange(self.inner)
+        for node in range(self.inner - 1, 0, -1):
+            self.later[self.parent[node]] = node
+
+    def weights(self, weight):
+        """Weight of every node from those of the scenarios (S,); the weights of a stage sum to one."""
+        return np.append(weight, 1.0)[self.history].prod(axis=1)
+
+
+def tree_qp(tree, n_x, n_u, active, changes, compile=True):
+    """A `TreeQP`, or where that cannot be compiled or shall not be a `ConicQP`.
+
+    active: (2, n_x), which states have a bound below and above; changes: whether a change of the actions has a price.
+    """
+    if compile:
+        try:
+            return TreeQP(tree, n_x, n_u, active, changes)
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"notice: the quadratic programs go to PIQP, several times slower ({error})", file=sys.stderr)
+    return ConicQP(tree, n_x, n_u, active, changes)
+
+
+def pointer(array):
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+class TreeQP:
+    """HPIPM's tree solver (BSD licence), one instance with memory of its own.
+
+    `solve` takes arrays with a row per edge (A, B, slope, hessian, x_low, x_high, price (edges, 2, rows)) or per node with children
+    (u_low, u_high, change, moved), A, B and hessian transposed as CasADi stores them. It returns du (inner, n_u) and the cost there, or
+    (None, nan) if the problem is not solved. `iterations`: of the last solve.
+    """
+
+    def __init__(self, tree, n_x, n_u, active, changes):
+        search = [f"-L{WHEEL}", "-lhpipm", "-lblasfeo", "-lm", f"-Wl,-rpath,{WHEEL}"]
+        self.library = ctypes.CDLL(str(compiled(Path(__file__).with_suffix(".c").read_text(), f"-I{WHEEL / 'include'}", link=search)))
+        self.library.tree_qp_new.restype = ctypes.c_void_p
+        self.row = np.flatnonzero(active.any(axis=0)).astype(np.int32)
+        parent, stage = (np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage))
+        active = np.ascontiguousarray(active[:, self.row], dtype=float)
+        sizes = map(int, (len(parent), tree.inner, n_x, n_u, len(self.row), changes))
+        new = self.library.tree_qp_new(*sizes, *map(pointer, (parent, stage, self.row, active)), ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
+        self.instance = ctypes.c_void_p(new)
+        self.free = weakref.finalize(self, self.library.tree_qp_free, self.instance)
+        self.du, self.cost, self.counted = np.zeros((tree.inner, n_u)), ctypes.c_double(), ctypes.c_int()
+
+    @property
+    def iterations(self):
+        return self.counted.value
+
+    def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier):
+        arrays = [np.ascontiguousarray(a) for a in (A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved)]
+        status = self.library.tree_qp_solve(self.instance, *map(pointer, arrays), ctypes.c_double(barrier), pointer(self.du),
+                                            ctypes.byref(self.cost), ctypes.byref(self.counted))  # fmt: skip
+        solved = status == 0 and np.isfinite(self.du).all()
+        return (self.du, self.cost.value) if solved else (None, np.nan)
+
+
+def positive_part(hessian):
+    """Projection of symmetric matrices (..., n, n) to positive semidefinite ones."""
+    values, vectors = np.linalg.eigh((hessian + np.swapaxes(hessian, -1, -2)) / 2)
+    return (vectors * np.maximum(values, 0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+
+
+class ConicQP:
+    """The same by a solver of CasADi's `conic`, as one sparse problem in (dx, du, slack below, slack above)."""
+
+    def __init__(self, tree, n_x, n_u, active, changes, plugin="piqp", options=None):
+        parent, inner = tree.parent, tree.inner
+        edges, self.row, self.iterations = len(parent) - 1, np.flatnonzero(active.any(axis=0)), 0
+        rows, price = len(self.row), (2 * np.flatnonzero(active.any(axis=0)).size, edges)
+        sizes = {"A": (n_x, n_x * edges), "B": (n_x, n_u * edges), "slope": (n_x, edges), "hessian": (n_x, n_x * edges), "price": price,
+                 "change": (n_u, inner), "moved": (n_u, inner)}  # fmt: skip
+        p = {name: ca.MX.sym(name, *size) for name, size in sizes.items()}
+        dx, du, below, above = (ca.MX.sym(name, n, k) for name, n, k in
+                                (("dx", n_x, edges), ("du", n_u, inner), ("below", rows, edges), ("above", rows, edges)))  # fmt: skip
+        f, dynamics = ca.dot(p["price"], ca.vertcat(below, above)) + RIDGE / 2 * ca.sumsqr(du), []
+        for e, before in enumerate(parent[1:]):
+            A, B, hessian = (p[name][:, e * k : (e + 1) * k] for name, k in (("A", n_x), ("B", n_u), ("hessian", n_x)))
+            f += ca.dot(p["slope"][:, e], dx[:, e]) + ca.bilin(hessian, dx[:, e], dx[:, e]) / 2
+            dynamics.append(dx[:, e] - B @ du[:, int(before)] - (A @ dx[:, int(before) - 1] if before else 0))
+        for i in range(inner):
+            step = du[:, i] - (du[:, int(parent[i])] if i else 0)
+            f += ca.dot(p["change"][:, i], step**2 + 2 * p["moved"][:, i] * step)
+        bounded = dx[self.row.tolist(), :]
+        problem = {"x": ca.veccat(dx, du, below, above), "p": ca.veccat(*p.values()), "f": f,
+                   "g": ca.veccat(*dynamics, bounded + below, bounded - above)}  # fmt: skip
+        quiet = {"highs": {"highs": {"output_flag": False}}, "qpoases": {"printLevel": "none"}}.get(plugin, {})
+        self.solver = ca.qpsol("qp", plugin, problem, quiet | {"error_on_fail": False} | (options or {}))
+        self.unbounded = ~active[:, self.row]
+        self.square = edges, n_x, n_x
+        self.zeros, self.shape, self.at = np.zeros(edges * n_x), (inner, n_u), edges * n_x
+
+    def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier=None):
+        low, high = np.where(self.unbounded[0], -np.inf, x_low).ravel(), np.where(self.unbounded[1], np.inf, x_high).ravel()
+        none, slack = np.full(low.size, np.inf), np.zeros(2 * low.size)
+        found = self.solver(
+            p=np.concatenate([np.ravel(a) for a in (A, B, slope, positive_part(np.reshape(hessian, self.square)), price, change, moved)]),
+            lbg=np.concatenate([self.zeros, low, -none]),
+            ubg=np.concatenate([self.zeros, none, high]),
+            lbx=np.concatenate([self.zeros - np.inf, np.ravel(u_low), slack]),
+            ubx=np.concatenate([self.zeros + np.inf, np.ravel(u_high), slack + np.inf]),
+        )
+        du = np.array(found["x"]).ravel()[self.at :][: u_low.size].reshape(self.shape)
+        if not self.solver.stats()["success"] or not np.isfinite(du).all():
+            return None, np.nan
+        return du, float(found["f"])
