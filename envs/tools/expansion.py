@@ -1,6 +1,10 @@
-"""A critic's value with its first and second derivatives."""
+"""A critic's value with its first and second derivatives in CasADi, and in torch, which the export is checked against."""
 
 import casadi as ca
+import numpy as np
+import torch
+
+import envs
 
 
 def expansion(critic):
@@ -12,7 +16,7 @@ def expansion(critic):
     """
     s, actor, n_x = critic.scaling, critic.actor, len(critic.plant.X_LOW)
     x, goal, mismatch = (ca.MX.sym(*size) for size in (("x", n_x), ("goal", s["goal_center"].size), ("mismatch", n_x)))
-    z = critic.features(ca.vertcat(x, mismatch) if critic.mismatch_scale else x, goal, ca)
+    z = critic.features(ca.vertcat(x, mismatch) if critic.mismatch_scale else x, goal)
     z_x = ca.densify(ca.jacobian(z, x))
 
     def scaled_rows(column, matrix):
@@ -55,4 +59,49 @@ def expansion(critic):
         parts = [ca.if_else(results[0][0] < results[1][0], a, b) for a, b in zip(*results)]
     else:
         parts = [sum(part) / len(results) for part in zip(*results)]
-    return ca.Function("expansion", [x, goal, mismatch], [ca.densify(part) for part in parts], ["x", "goal", "mismatch"], ["V", "gradient", "hessian"])
+    return ca.Function("expansion", [x, goal, mismatch], [ca.densify(part) for part in parts])
+
+
+def torch_value(critic, x, goal):
+    """V in torch, float64: x (B, n_x), with the mismatch behind it if the critic observes it, goal (B, n_goal) -> (B,)."""
+    s = {k: v.tolist() if v.dtype == int else torch.from_numpy(v) for k, v in critic.scaling.items()}
+    if critic.goal_input == "error":
+        goal = goal - x[:, s["goal_index"]]
+        g = goal / s["error_scale"]
+    else:
+        g = (goal - s["goal_center"]) / s["goal_scale"]
+    angles = torch.cat([x, goal], dim=1)[:, s["angle_index"]]
+    others = torch.cat([(x - s["x_center"]) / s["x_scale"], g], dim=1)[:, s["other_index"]]
+    z = torch.cat([others, angles.sin(), angles.cos()], dim=1)
+
+    def mlp(layers, h):
+        for i, (w, b) in enumerate(layers):
+            h = torch.nn.functional.linear(h, torch.tensor(w), torch.tensor(b[:, 0]))
+            h = torch.nn.functional.silu(h) if i < len(layers) - 1 else h
+        return h
+
+    inputs = torch.cat([z, torch.tanh(mlp(critic.actor, z))], dim=1)
+    first, second = (mlp(twin, inputs)[:, 0] for twin in critic.twins)
+    return {"min": torch.fmin(first, second), "first": first, "mean": (first + second) / 2}[critic.combine]
+
+
+def check_export(critic, V, points=64, tolerance=1e-8):
+    """Compare value and gradient of V(x, goal) with torch at random states: the largest scaled difference.
+
+    Raises RuntimeError if it is above the tolerance.
+    """
+    plant, rng = critic.plant, np.random.default_rng(0)
+    x = torch.tensor(envs.sample_states(plant, rng, points), requires_grad=True)
+    goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH, size=(points, len(plant.GOAL_LOW)))
+    seen = [rng.uniform(-1, 1, size=x.shape)] if critic.mismatch_scale else []
+    value = torch_value(critic, torch.cat([x, *map(torch.from_numpy, seen)], dim=1), torch.from_numpy(goal))
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    value, x_scale = value.detach().numpy(), critic.scaling["x_scale"][: x.shape[1]]
+    inputs = [ca.MX.sym(V.name_in(i), V.size1_in(i)) for i in range(V.n_in())]
+    both = ca.Function("both", inputs, [V(*inputs), ca.gradient(V(*inputs), inputs[0])]).map(points)
+    v, slope = (np.array(part) for part in both(*(array.T for array in (x.detach().numpy(), goal, *seen))))
+    errors = v[0] - value, (slope.T - gradient.numpy()) * x_scale  # slopes per unit of the network's input
+    worst = max(np.abs(error).max() for error in errors) / (1 + np.abs(value).max())
+    if not worst < tolerance:
+        raise RuntimeError(f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run")
+    return worst

@@ -29,7 +29,7 @@ class ScenarioTree:
             raise ValueError(f"horizon is {horizon}, robust_horizon {robust_horizon}; they must be at least 1 and 0")
         leaves = scenarios ** min(robust_horizon, horizon)
         if leaves * horizon > MAX_NODES:
-            raise ValueError(f"robust_horizon {robust_horizon} gives a tree of {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
+            raise ValueError(f"robust_horizon {robust_horizon} gives {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
         self.nodes = [scenarios ** min(t, robust_horizon) for t in range(horizon + 1)]
         self.first = np.cumsum([0, *self.nodes])
         self.inner = int(self.first[horizon])
@@ -84,9 +84,10 @@ class TreeQP:
         self.library.tree_qp_new.restype = ctypes.c_void_p
         self.row = np.flatnonzero(active.any(axis=0)).astype(np.int32)
         parent, stage = (np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage))
-        active = np.ascontiguousarray(active[:, self.row], dtype=float)
+        active = self.active = np.ascontiguousarray(active[:, self.row], dtype=float)
         sizes = map(int, (len(parent), tree.inner, n_x, n_u, len(self.row), changes))
-        new = self.library.tree_qp_new(*sizes, *map(pointer, (parent, stage, self.row, active)), ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
+        arrays = map(pointer, (parent, stage, self.row, active))
+        new = self.library.tree_qp_new(*sizes, *arrays, ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
         self.instance = ctypes.c_void_p(new)
         self.free = weakref.finalize(self, self.library.tree_qp_free, self.instance)
         self.du, self.cost, self.counted = np.zeros((tree.inner, n_u)), ctypes.c_double(), ctypes.c_int()
@@ -96,6 +97,7 @@ class TreeQP:
         return self.counted.value
 
     def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier):
+        price = np.where(self.active > 0, price, 1.0)  # of a bound that is not there, too
         arrays = [np.ascontiguousarray(a) for a in (A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved)]
         status = self.library.tree_qp_solve(self.instance, *map(pointer, arrays), ctypes.c_double(barrier), pointer(self.du),
                                             ctypes.byref(self.cost), ctypes.byref(self.counted))  # fmt: skip

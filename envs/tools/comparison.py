@@ -1,0 +1,85 @@
+"""Closed loops on paired draws of start state and plant, over several processes."""
+
+import csv
+import multiprocessing
+import signal
+import tempfile
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+import envs
+
+METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
+
+
+def draws(plant, episodes, seed):
+    """Start states (episodes, n_x) uniform in their box and plants (episodes, n_psi) from the evaluation set."""
+    rngs = [np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)]  # of any number, the first are the same
+    starts = np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs])
+    return starts, np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
+
+
+def run_episode(controller, plant, x0, psi, goal, steps):
+    """Closed loop on a plant with fixed parameters: x (steps + 1, n_x), u (steps, n_u) and the row of results.csv."""
+    controller.reset()
+    x, u, log = [np.array(x0, dtype=float)], [], []
+    for _ in range(steps):
+        u.append(controller.make_step(x[-1]))
+        x.append(plant.step(x[-1], u[-1], psi))
+        log.append(controller.stats)
+    x, u = np.array(x), np.array(u)
+    milliseconds = [stats["wall_ms"] for stats in log]
+    achieved = x[1:, plant.GOAL_INDEX]
+    row = {
+        "time_near_goal": envs.goal_reward(plant, achieved, goal, sigma2=METRIC_SIGMA2).sum(),
+        "time_outside_constraints": envs.outside_constraints(plant, x[1:], METRIC_SIGMA2).sum(),
+        "ape_tail": plant.percentage_error(achieved, np.asarray(goal))[-25:].mean(),
+        "solve_ms_median": np.median(milliseconds),
+        "solve_ms_p95": np.quantile(milliseconds, 0.95),
+        "iterations": np.mean([stats["iterations"] for stats in log]),
+        "late": sum(stats["late"] for stats in log),
+        "fell_back": sum(stats["fell_back"] for stats in log),
+    }
+    return x, u, row
+
+
+def parallel(function, jobs, processes, first=0):
+    """[function(*job) for job in jobs] over processes; the `first` ones are done before the others begin."""
+    # else CasADi would take Ctrl-C for a failed evaluation, and torch does not survive a fork
+    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))
+    pool = ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn"), **quit_at_once)
+    futures = []
+    try:
+        with tqdm(total=len(jobs), unit="episode", disable=None) as bar:
+            for part in (jobs[:first], jobs[first:]):
+                started = [pool.submit(function, *job) for job in part]
+                for future in as_completed(started):
+                    future.result()
+                    bar.update()
+                futures += started
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [future.result() for future in futures]
+
+
+def output_folder(out, name):
+    """The folder `out`, or runs/NAME, made and tried. Raises ValueError where it cannot be written."""
+    try:
+        folder = out or envs.new_folder(Path("runs") / name)
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ValueError(f"--out {out or 'runs'}: cannot write there ({error.strerror})") from None
+    return folder
+
+
+def write_csv(rows, path):
+    """Rows of equal keys as a table; a killed process leaves no half of it."""
+    with open(path.with_suffix(".tmp"), "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    path.with_suffix(".tmp").replace(path)

@@ -1,0 +1,104 @@
+"""What controllers share around their action, and those that do not plan: the learned policy, and the critic's best action."""
+
+import time
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import minimize
+
+import envs
+
+
+def call(function, *arguments):
+    """A function of (x, goal), or of (x, goal, mismatch)."""
+    return function(*arguments[: function.n_in()])
+
+
+class Controller:
+    """What every controller does around its action: `u = make_step(x0)`, `set_goal(goal)`, `reset()`, `stats`.
+
+    A subclass defines `action(x, tick)`: the action (n_u,) for the state x (n_x,), physical units, of a step that
+    began at tick. Where that is not finite the last action is applied again.
+    """
+
+    horizon = None
+
+    def __init__(self, plant, goal, estimator=None):
+        self.plant, self.estimator = plant, estimator or envs.Estimator(plant)
+        self.set_goal(goal)
+        self.reset()
+
+    def reset(self):
+        """Forget everything, as at the start of an episode."""
+        self.x_before, self.u_before = None, np.zeros(len(self.plant.U_LOW))
+        self.stats = {}
+        self.estimator.reset()
+
+    def set_goal(self, goal):
+        """The goal from now on: a number or (n_goal,); of a planner also (n_goal, N), a goal per stage x_1 ... x_N.
+
+        Raises ValueError for another shape or a goal outside the plant's range.
+        """
+        self.goal = envs.checked_goal(self.plant, goal, self.horizon)
+
+    def make_step(self, x0):
+        """The action (n_u,), finite and within its limits, for the measured state x0 (n_x,), physical units.
+
+        Raises ValueError for a state that is not one and stays as it was. Angles are taken to the turn nearest to the last.
+        """
+        x, tick = envs.checked_state(self.plant, x0), time.perf_counter()
+        if self.x_before is not None:
+            turns = np.round((self.x_before - x) / (2 * np.pi))
+            x[self.plant.ANGLES] += 2 * np.pi * turns[self.plant.ANGLES]
+        self.estimator.update(x)
+        self.stats = {"rung": "actor", "fell_back": False, "iterations": 0, "late": False}
+        u = self.action(x, tick)
+        if not np.isfinite(u).all():
+            self.stats |= {"rung": "hold", "fell_back": True}
+            u = self.u_before
+        self.x_before, self.u_before = x, np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
+        self.estimator.before = self.x_before, self.u_before
+        self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
+        return self.u_before.copy()
+
+
+class ActorController(Controller):
+    """The learned policy alone; actor: CasADi function (x, goal) or (x, goal, mismatch) -> u."""
+
+    def __init__(self, plant, actor, goal, estimator=None):
+        super().__init__(plant, goal, estimator)
+        self.actor = actor
+
+    def action(self, x, tick=None):
+        return np.array(call(self.actor, x, self.goal, self.estimator.mismatch)).ravel()
+
+
+class GreedyController(ActorController):
+    """Horizon 0: argmax over u in U of Q(x, u, goal), by L-BFGS-B from the actor's action and the best of some points.
+
+    The points are a grid for one or two actions, random for more.
+    """
+
+    def __init__(self, plant, actor, Q, goal, estimator=None, points=9):
+        super().__init__(plant, actor, goal, estimator)
+        n_u = len(plant.U_LOW)
+        sizes = (("v", n_u), ("x", len(plant.X_LOW)), ("goal", len(self.goal)), ("mismatch", len(plant.X_LOW)))
+        v, *given = (ca.MX.sym(*size) for size in sizes)  # v: action scaled to [0, 1]
+        q = call(Q, given[0], plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), *given[1:])
+        self.negative_q = ca.Function("negative_q", [v, *given], [-q, -ca.gradient(q, v)])
+        grid = np.meshgrid(*[np.linspace(0, 1, points)] * min(n_u, 2))
+        self.points = np.stack([a.ravel() for a in grid])  # (n_u, points^n_u)
+        if n_u > 2:
+            self.points = np.random.default_rng(0).uniform(size=(n_u, points**2))
+
+    def action(self, x, tick=None):
+        given, span = (x, self.goal, self.estimator.mismatch), self.plant.U_HIGH - self.plant.U_LOW
+        at_points = np.array(self.negative_q(self.points, *given)[0]).ravel()
+        starts = [(super().action(x) - self.plant.U_LOW) / span, self.points[:, at_points.argmin()]]
+
+        def objective(v):
+            return tuple(np.array(part).ravel() for part in self.negative_q(v, *given))
+
+        bounds = [(0, 1)] * len(span)
+        found = [minimize(objective, v, jac=True, method="L-BFGS-B", bounds=bounds) for v in starts]
+        return self.plant.U_LOW + np.clip(min(found, key=lambda result: result.fun).x, 0, 1) * span
