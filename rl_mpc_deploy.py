@@ -139,9 +139,12 @@ class Critic:
         pairs = [(critic[f"weight.{i}"], critic[f"bias.{i}"]) for i in range(len(sizes))]
         self.twins = [[(w[j].T, b[j].T) for w, b in pairs] for j in range(2)]
         # what torch would refuse, and what is no use
-        widths = [[w.shape[1] for w, _ in layers] for layers in (self.actor, *self.twins)]
-        if widths != [sizes, *[[sizes[0] + n_u, *sizes[1:]]] * 2] or self.goal_input not in ("error", "goal"):
-            raise ValueError("networks that do not fit")
+        shapes = [(w.shape, b.shape) for layers in (actor, *self.twins) for w, b in layers]
+        wanted = [[*sizes, 2 * n_u], *[[sizes[0] + n_u, *sizes[1:], 1]] * 2]
+        if shapes != [((m, n), (m, 1)) for widths in wanted for n, m in zip(widths, widths[1:])]:
+            raise ValueError("weights that do not fit")
+        if self.goal_input not in ("error", "goal"):
+            raise ValueError(f"unknown goal_input {self.goal_input!r}")
         if not all((v > 0).all() for name, v in self.scaling.items() if name.endswith("scale")):
             raise ValueError("scales that are not positive")
         weights = [part for layers in (self.actor, *self.twins) for layer in layers for part in layer]

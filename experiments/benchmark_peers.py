@@ -4,10 +4,16 @@
     python experiments/benchmark_peers.py --plot-only      # redraw from the committed CSV
 
 The peers live in environments of their own (see requirements-peers.txt and requirements-peers-new.txt for how they are made); where one
-is not there, its rows say so and this repository's side is measured alone. Each row is a closed loop of both controllers from the same
-starts on the same plant, every one on its own states; peer_do_mpc.py is the other side. On the reactor both solve the literal problem
-(literal.py), everywhere to a tolerance of 1e-6 and with exact bounds. `same_optimum` is the relative difference of the objectives at
-the first start, solved by both to 1e-9 from the start state held at every node. On the same model, this repository's Runge-Kutta steps,
+is not there, its rows say so and this repository's side is measured alone. Each row is a closed loop of every controller from the same
+starts on the same plant, every one on its own states; peer_do_mpc.py is the other side, IPOPT to a tolerance of 1e-6 with exact bounds.
+
+On the reactor this side is the planner of rl_mpc_deploy.py, three times: converged (at most 50 iterations a step), with its default of 5,
+and with one. The peers solve the literal problem (literal.py). Ours differs from it by convention only: stage cost and soft constraints at
+x_1 ... x_N instead of x_0 ... x_{N-1}, and means over the nine scenarios where the peers sum slack and changes, so that prices are nine
+times theirs. On the pendulum this side is goal_mpc.py's IPOPT.
+
+`same_optimum` says that the peers' problem is the one in words: the relative difference of their objective and that of literal.py, both
+by IPOPT at the first start, to 1e-9 from the start state held at every node. On the same model, this repository's Runge-Kutta steps,
 it must be small, unless there are several optima; the collocation rows are another model.
 
 Writes results/benchmark_peers.csv and figures/benchmark_peers.png.
@@ -27,18 +33,18 @@ import torch
 import tyro
 
 matplotlib.use("Agg")
-import casadi as ca
 import matplotlib.pyplot as plt
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
-from literal import LiteralMPC
+import literal
 
 import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.tools.expansion import expansion
 
 LABELS = {
     "l4casadi": "do-mpc 4.6.5 + L4CasADi, same model",
@@ -51,9 +57,13 @@ LABELS = {
 }
 WITH_CRITIC, WITHOUT = ("l4casadi", "l4casadi, collocation", "casadi"), ("MX", "SX", "MX, collocation", "SX, collocation")
 CELLS = [("cstr", n, "random", peer) for n in (1, 2, 5) for peer in WITH_CRITIC]
-CELLS += [("cstr", 20, kind, peer) for kind in ("none", "small barrier") for peer in WITHOUT]
+CELLS += [("cstr", 20, "none", peer) for peer in WITHOUT]
 CELLS += [("double_pendulum", n, "none", peer) for n in (25, 75) for peer in WITHOUT]
 CELLS += [("cstr", n, "trained", peer) for n in (1, 2, 5) for peer in ("l4casadi", "casadi")]
+ITERATIONS = {"ours": 50, "ours_default": deploy.Args.iterations, "ours_one": 1}  # of this repository's planner
+OURS = {"ours": "this repository", "ours_default": f"the same, {deploy.Args.iterations} iterations", "ours_one": "the same, one iteration"}
+S = len(cstr.SCENARIOS["mpc"])
+BLIND = np.repeat([[0.0], [1.0]], 4, axis=1)  # price of slack beside a critic: above the upper bounds, as published
 CSTR_START = np.array([0.8, 0.4, 134.14, 130.0])  # of the authors' scripts
 
 
@@ -83,55 +93,68 @@ class Args:
 
 def load_critic(kind, seed):
     """The shipped robust critic, or its architecture with random weights: (critic, its weights for the peer)."""
-    critic = deploy.load_critic(HERE / "pretrained/cstr_robust.pt", "cstr")
+    critic, rng = deploy.load_critic(HERE / "pretrained/cstr_robust.pt", "cstr"), np.random.default_rng([seed, 6])
+
+    def drawn(layers):
+        return [(rng.uniform(-1, 1, w.shape) / np.sqrt(w.shape[1]), rng.uniform(-0.1, 0.1, b.shape)) for w, b in layers]
+
     if kind == "random":
-        generator = torch.Generator().manual_seed(seed)
-        with torch.no_grad():
-            for p in [*critic.actor.parameters(), *critic.critic.parameters()]:
-                bound = p.shape[-2] ** -0.5 if p.dim() > 1 else 0.1
-                p.copy_(bound * (2 * torch.rand(p.shape, generator=generator, dtype=p.dtype) - 1))
-    actor, twins = critic.layers()
+        critic.actor, critic.twins = drawn(critic.actor), [drawn(twin) for twin in critic.twins]
     weights = {name: critic.scaling[name] for name in ("x_center", "x_scale", "error_scale", "goal_index")}
-    for name, layers in (("actor", actor), ("critic", twins[0])):
+    for name, layers in (("actor", critic.actor), ("critic", critic.twins[0])):
         for i, (w, b) in enumerate(layers):
             weights |= {f"{name}_w{i}": w, f"{name}_b{i}": b.ravel()}
     return critic, {name: value.tolist() for name, value in weights.items()}
 
 
-def problems(env, horizon, kind, peer, seed, tol=1e-6, compile=True):
-    """This repository's controller and the same problem in words for the peer."""
-    plant, options = envs.load(env), dict(tol=tol, compile=compile)
-    shared = {"env": env, "horizon": horizon, "goal": plant.EVAL_GOAL.tolist(), "model": "collocation" if "collocation" in peer else "rk4",
-              "tol": tol, "symbols": "SX" if "SX" in peer else "MX", "degree": 2 if env == "cstr" else 3}  # fmt: skip
+def in_words(env, horizon, kind, peer, seed, tol=1e-6):
+    """The literal problem for the peer."""
+    plant = envs.load(env)
+    words = {"env": env, "horizon": horizon, "goal": plant.EVAL_GOAL.tolist(), "model": "collocation" if "collocation" in peer else "rk4",
+             "tol": tol, "symbols": "SX" if "SX" in peer else "MX", "degree": 2 if env == "cstr" else 3}  # fmt: skip
     if env == "double_pendulum":
-        costs = gm.costs(plant, "goal")
-        mpc = gm.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], *costs, goal=plant.EVAL_GOAL, slack_price=np.inf, **options)
-        words = {"robust_horizon": 0, "sigma2": plant.MPC_SIGMA2, "change_weight": {"force": 0.0}, "u_scale": [5.0], "soft": {},
-                 "hard": {"position": (-5.0, 5.0)}, "uncertainty": dict.fromkeys(plant.PSI_NAMES, [1.0])}  # fmt: skip
-        return mpc, shared | words
-    x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
-    squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
-    scenarios, sigma2 = plant.SCENARIOS["mpc"], plant.MPC_SIGMA2 if kind in ("random", "trained") else None
-    words = {"robust_horizon": 1, "sigma2": sigma2, "u_scale": [100.0, 2000.0],
-             "uncertainty": {"alpha": [1.0, 0.95, 1.05], "beta": [1.0, 0.9, 1.1]}}  # fmt: skip
-    if kind not in ("random", "trained"):  # the robust benchmark; a small barrier is faster, but leaves fewer local optima
-        stage = ca.Function("stage", [x, g], [squared_error])
-        mpc = LiteralMPC(plant, horizon, scenarios, stage, stage, goal=plant.EVAL_GOAL, relaxed_price=1e3,
-                         slack_price=plant.BENCHMARK["slack_price"], change_weight=plant.BENCHMARK["change_weight"],
-                         barrier=1e-4 if kind == "none" else 1e-7, **options)  # fmt: skip
-        # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 and this repository sum it
-        words |= {"change_weight": {"F": 9 * 0.1, "Q_dot": 9 * 1e-3}, "soft": {"T_R": (140.0, 100.0)},
-                  "hard": {"c_A": (0.1, 2.0), "c_B": (0.1, 2.0), "T_R": (50.0, None), "T_K": (50.0, 140.0)}}  # fmt: skip
-        return mpc, shared | words
-    critic, weights = load_critic(kind, seed)
-    mu, _, V = deploy.export(critic)
-    stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
-    mpc = LiteralMPC(plant, horizon, scenarios, stage, ca.Function("terminal", [x, g], [-V(x, g)]), goal=plant.EVAL_GOAL, actor=mu,
-                     slack_price=[[0, 0, 0, 0], [1, 1, 1, 1]], barrier="adaptive", **options)  # fmt: skip
+        return words | {"robust_horizon": 0, "sigma2": plant.MPC_SIGMA2, "change_weight": {"force": 0.0}, "u_scale": [5.0], "soft": {},
+                        "hard": {"position": (-5.0, 5.0)}, "uncertainty": dict.fromkeys(plant.PSI_NAMES, [1.0])}  # fmt: skip
+    words |= {"robust_horizon": 1, "u_scale": [100.0, 2000.0], "uncertainty": {"alpha": [1.0, 0.95, 1.05], "beta": [1.0, 0.9, 1.1]}}
+    if kind == "none":  # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 sums it as literal.py does
+        return words | {"sigma2": None, "change_weight": {"F": S * 0.1, "Q_dot": S * 1e-3}, "soft": {"T_R": (140.0, 100.0)},
+                        "hard": {"c_A": (0.1, 2.0), "c_B": (0.1, 2.0), "T_R": (50.0, None), "T_K": (50.0, 140.0)}}  # fmt: skip
     soft = {name: (high, 1.0) for name, high in zip(plant.STATE_NAMES, plant.X_HIGH)}
-    words |= {"change_weight": {"F": 0.0, "Q_dot": 0.0}, "hard": {}, "soft": soft, "critic": weights,
-              "network": "casadi" if peer == "casadi" else "l4casadi"}  # fmt: skip
-    return mpc, shared | words
+    return words | {"sigma2": plant.MPC_SIGMA2, "change_weight": {"F": 0.0, "Q_dot": 0.0}, "hard": {}, "soft": soft,
+                    "critic": load_critic(kind, seed)[1], "network": "casadi" if peer == "casadi" else "l4casadi"}  # fmt: skip
+
+
+def pendulum(horizon, **options):
+    plant = envs.load("double_pendulum")
+    costs = gm.costs(plant, "goal")
+    return gm.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], *costs, goal=plant.EVAL_GOAL, slack_price=np.inf, **options)
+
+
+def ours(env, horizon, kind, seed):
+    """This repository's controllers, by the columns of their times."""
+    if env == "double_pendulum":
+        return {"ours": pendulum(horizon)}
+    options = dict(goal=cstr.EVAL_GOAL, slack_price=S * cstr.BENCHMARK["slack_price"], change_weight=S * cstr.BENCHMARK["change_weight"])
+    stage = literal.squared_error(cstr)
+    if kind != "none":
+        critic, _ = load_critic(kind, seed)
+        (mu, _, V), stage = deploy.export(critic), literal.gaussian(cstr)
+        options = dict(goal=cstr.EVAL_GOAL, slack_price=S * BLIND, value=V, policy=mu, expansion=expansion(critic))
+    return {name: deploy.ScenarioMPC(cstr, horizon, cstr.SCENARIOS["mpc"], stage, iterations=iterations, **options)
+            for name, iterations in ITERATIONS.items()}  # fmt: skip
+
+
+def reference(env, horizon, kind, seed):
+    """The peer's problem by IPOPT, and a function of the start state that gives what its objective has beside the peer's."""
+    options = dict(tol=1e-9, compile=False)
+    if env == "double_pendulum":
+        return pendulum(horizon, **options), lambda x0: 0.0
+    stage, terminal = literal.squared_error(cstr), literal.squared_error(cstr)
+    options |= dict(goal=cstr.EVAL_GOAL, slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"])
+    if kind != "none":
+        stage, terminal = literal.gaussian(cstr), literal.negative(deploy.export(load_critic(kind, seed)[0])[2])
+        options |= dict(slack_price=BLIND, change_weight=0.0)
+    return literal.LiteralMPC(cstr, horizon, cstr.SCENARIOS["mpc"], stage, terminal, **options), lambda x0: float(stage(x0, cstr.EVAL_GOAL))
 
 
 class Peer:
@@ -158,15 +181,13 @@ class Peer:
 def same_optimum(cell, x0):
     """Relative difference of the first solves' objectives, both from the start state held; empty if one failed."""
     env, horizon, kind, peer, python, *_, seed, _ = cell
-    mpc, words = problems(env, horizon, kind, peer, seed, tol=1e-9, compile=False)
-    other = Peer(python, words)
+    (mpc, beside), other = reference(env, horizon, kind, seed), Peer(python, in_words(env, horizon, kind, peer, seed, tol=1e-9))
     theirs = other.ask({"x": x0.tolist(), "new": True})
     other.close()
-    mpc.stats = {"iterations": 0}
-    price = () if isinstance(mpc, gm.ScenarioMPC) else (mpc.slack_price,)
-    if mpc._solve("cold", x0, *price, mpc.hold_guess(x0)) is None or not theirs["success"]:
+    mpc.make_step(x0)
+    if mpc.stats["rung"] != "solved" or not theirs["success"]:
         return ""
-    return f"{abs(mpc.last_objective / theirs['objective'] - 1):.1e}"
+    return f"{abs((mpc.last_objective - beside(x0)) / theirs['objective'] - 1):.1e}"
 
 
 def summary(name, steps):
@@ -178,74 +199,77 @@ def summary(name, steps):
             f"{name}_status": json.dumps(Counter(step["status"] for step in steps))}  # fmt: skip
 
 
+def outcome(stats):
+    """A step of this repository in the peer's words."""
+    found = {"ms": stats["wall_ms"], "iterations": stats["iterations"]}
+    if "status" in stats:  # IPOPT
+        return found | {"success": stats["success"], "status": stats["status"]}
+    return found | {"success": not stats["fell_back"] and stats["stop"] != "unsolved", "status": stats.get("stop", stats["rung"])}
+
+
 def measure(cell):
-    """One row: both controllers in closed loop from every start, in turn; where there is no peer, this repository's alone."""
+    """One row: all controllers in closed loop from every start, in turn; where there is no peer, this repository's alone."""
     env, horizon, kind, peer, python, starts, steps, seed, core = cell
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
-    mpc, words = problems(env, horizon, kind, peer, seed)
-    plant, other, same = mpc.plant, None, ""
+    mine, words = ours(env, horizon, kind, seed), in_words(env, horizon, kind, peer, seed)
+    plant, other, same = mine["ours"].plant, None, ""
     rng = np.random.default_rng([seed, 5])
     base = CSTR_START if plant is cstr else plant.START
-    x_starts = (
-        base + rng.uniform(-1, 1, size=(starts, len(base))) * plant.START_NOISE * (np.arange(starts) > 0)[:, None]
-    )  # the first as it is
+    noise = rng.uniform(-1, 1, size=(starts, len(base))) * plant.START_NOISE
+    x_starts = base + noise * (np.arange(starts) > 0)[:, None]  # the first as it is
     psi = plant.EVAL_PSI[rng.integers(len(plant.EVAL_PSI), size=starts)]
     psi[0] = plant.PSI_NOMINAL
     if Path(python).exists():
         same = same_optimum(cell, x_starts[0]) if words["model"] == "rk4" else ""
         other = Peer(python, words)
-    mine, theirs = [], []
+    log, theirs = {name: [] for name in mine}, []
     for i in range(starts):
-        mpc.reset()
-        mpc.set_initial_guess(x_starts[i])
-        x, y = x_starts[i], x_starts[i]
+        states, y = dict.fromkeys(mine, x_starts[i]), x_starts[i]
+        for mpc in mine.values():
+            mpc.reset()
         for t in range(steps):
-            u = mpc.make_step(x)
-            x = plant.step(x, u, psi[i])
-            mine.append({"ms": mpc.stats["wall_ms"]} | {key: mpc.stats[key] for key in ("success", "status", "iterations")})
+            for name, mpc in mine.items():
+                states[name] = plant.step(states[name], mpc.make_step(states[name]), psi[i])
+                log[name].append(outcome(mpc.stats))
             if other is None or not np.isfinite(y).all():
                 continue
             theirs.append(other.ask({"x": y.tolist(), "new": t == 0}))
             y = plant.step(y, np.clip(theirs[-1]["u"], plant.U_LOW, plant.U_HIGH), psi[i])
     if other is not None:
         other.close()
-    critic = kind if kind in ("random", "trained") else "none"
-    row = {
-        "env": env,
-        "horizon": horizon,
-        "critic": critic,
-        "barrier": getattr(mpc, "barrier", 1e-7),
-        "peer": LABELS[peer],
-        "starts": starts,
-        "steps": steps,
-        "same_optimum": same,
-    }
-    row |= summary("ours", mine)
+    row = {"env": env, "horizon": horizon, "critic": kind, "peer": LABELS[peer], "starts": starts, "steps": steps, "same_optimum": same}
+    row |= summary("ours", log["ours"])
+    for name in ("ours_default", "ours_one"):
+        columns = summary(name, log[name]) if name in log else {}
+        row |= {f"{name}_ms_{part}": columns.get(f"{name}_ms_{part}", "") for part in ("median", "p95")}
     if theirs:
-        row |= summary("peer", theirs) | {"ratio_of_medians": "", "peer_versions": json.dumps(other.versions)}
-        if row["peer_failed"] == 0:
-            row["ratio_of_medians"] = round(row["peer_ms_median"] / row["ours_ms_median"], 2)
+        row |= summary("peer", theirs)
     else:
-        row |= dict.fromkeys([f"peer_{key[5:]}" for key in row if key.startswith("ours_")], "")
-        row |= {"peer_status": "not installed", "ratio_of_medians": "", "peer_versions": ""}
-    return [row | {"machine": cells.machine()}]
+        row |= {key: "" for key in summary("peer", log["ours"])} | {"peer_status": "not installed"}
+    for ratio, name in (("ratio_of_medians", "ours"), ("ratio_default", "ours_default"), ("ratio_one", "ours_one")):
+        known = row["peer_failed"] == 0 and row[f"{name}_ms_median"] != ""
+        row[ratio] = round(row["peer_ms_median"] / row[f"{name}_ms_median"], 2) if known else ""
+    return [row | {"peer_versions": json.dumps(other.versions) if theirs else "", "machine": cells.machine()}]
 
 
 def table(rows):
-    print(f"{'':51s}{'this repository, ms':>24s}{'peer, ms':>27s}")
-    print(f"{'problem and peer':51s}  median    p95  failed    median      p95  failed   ratio  same optimum")
+    titles = f"{'median':>11s}{'p95':>8s}{'failed':>8s}"
+    print(f"{'':51s}{'this repository, ms':>27s}{'default':>9s}{'one':>9s}{'peer, ms':>27s}{'ratios of medians':>24s}")
+    print(f"{'problem and peer':51s}{titles}{'median':>9s}{'median':>9s}{titles}{'':>8s}{'default':>8s}{'one':>8s}  same optimum")
+
+    def number(value, width):
+        return f"{float(value):{width}.1f}" if value else f"{'':{width}s}"
+
     for row in rows:
-        head = (
-            f"{row['env']} N = {row['horizon']}, {row['critic']} critic"
-            if row["critic"] != "none"
-            else f"{row['env']} N = {row['horizon']}"
-        )
-        peer = "  not installed"
+        print(f"{row['env']} N = {row['horizon']}" + (f", {row['critic']} critic" if row["critic"] != "none" else ""))
+        mine = number(row["ours_ms_median"], 11) + number(row["ours_ms_p95"], 8) + f"{row['ours_failed']:>8s}"
+        mine += number(row["ours_default_ms_median"], 9) + number(row["ours_one_ms_median"], 9)
+        peer = f"{'not installed':>27s}"
         if row["peer_ms_median"]:
-            peer = f"{float(row['peer_ms_median']):10.1f}{float(row['peer_ms_p95']):9.1f}{row['peer_failed']:>8s}"
-        mine = f"{float(row['ours_ms_median']):8.1f}{float(row['ours_ms_p95']):7.1f}{row['ours_failed']:>8s}"
-        print(f"{head}\n    {row['peer']:47s}{mine}{peer}{row['ratio_of_medians']:>8s}  {row['same_optimum']}")
+            peer = number(row["peer_ms_median"], 11) + number(row["peer_ms_p95"], 8) + f"{row['peer_failed']:>8s}"
+        ratios = "".join(number(row[key], 8) for key in ("ratio_of_medians", "ratio_default", "ratio_one"))
+        print(f"    {row['peer']:47s}{mine}{peer}{ratios}  {row['same_optimum']}")
 
 
 def plot(rows, path):
@@ -254,16 +278,15 @@ def plot(rows, path):
     groups = {}
     for row in rows:
         name = "reactor, RL+MPC" if row["critic"] != "none" else "reactor, robust MPC" if row["env"] == "cstr" else "pendulum"
-        small = ", barrier 1e-7" if row["env"] == "cstr" and row["barrier"] == "1e-07" else ""
-        groups.setdefault(f"{name}, N = {row['horizon']}{critics[row['critic']]}{small}", []).append(row)
-    fig, ax = plt.subplots(figsize=(9, 0.21 * (len(rows) + 2 * len(groups)) + 1), layout="constrained")
+        groups.setdefault(f"{name}, N = {row['horizon']}{critics[row['critic']]}", []).append(row)
+    fig, ax = plt.subplots(figsize=(9, 0.21 * (len(rows) + 4 * len(groups)) + 1), layout="constrained")
     y, ticks = 0, []
 
     def bar(row, side, colour, text):
         nonlocal y
         ticks.append((y, text))
         if row[f"{side}_ms_median"]:
-            median, p95, failed = (float(row[f"{side}_{key}"]) for key in ("ms_median", "ms_p95", "failed"))
+            median, p95, failed = (float(row.get(f"{side}_{key}", 0)) for key in ("ms_median", "ms_p95", "failed"))
             ax.plot([median, p95], [y, y], color=colour, lw=2.5)
             ax.plot(median, y, "o", color=colour, mec="black", mew=0.5, ms=6)
             words = f"{median:.3g} ms" + (f", {failed:.0f} of {int(row['starts']) * int(row['steps'])} failed" if failed else "")
@@ -276,7 +299,10 @@ def plot(rows, path):
         ax.annotate(name, (0.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9, weight="bold")
         y += 1
         # this repository was timed once beside each peer: the middle one
-        bar(sorted(mine, key=lambda row: float(row["ours_ms_median"]))[len(mine) // 2], "ours", "#0072B2", "this repository")
+        middle = sorted(mine, key=lambda row: float(row["ours_ms_median"]))[len(mine) // 2]
+        for side, text in OURS.items():
+            if middle[f"{side}_ms_median"]:
+                bar(middle, side, "#0072B2", text)
         for row in mine:
             bar(row, "peer", "#D55E00", row["peer"])
         y += 0.4

@@ -97,7 +97,7 @@ def collect(function, cells, jobs, folder, inputs):
     Cells are told apart by their repr; `inputs` are the files that results depend on, or their contents, beside the scripts' shared tools
     (a change makes every cell new).
     """
-    inputs = [*inputs, *sorted(TOOLS.glob("*.py"))]
+    inputs = [*inputs, *sorted([*TOOLS.glob("*.py"), *TOOLS.glob("*.c")])]
     version = hashlib.sha256(b"".join(file if isinstance(file, bytes) else Path(file).read_bytes() for file in inputs)).digest()
     paths = [folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells]
     quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve

@@ -2,8 +2,9 @@
 
     python experiments/cstr_deploy.py --jobs 2                   # 200 draws, 50 minutes; continues where it stopped
     python experiments/cstr_deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
-    python experiments/cstr_deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours
-    python experiments/cstr_deploy.py --study expansion --jobs 2 # the learned value and its second-order expansions
+    python experiments/cstr_deploy.py --study ipopt --jobs 2     # the same problems solved by IPOPT
+    python experiments/cstr_deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours, all by IPOPT
+    python experiments/cstr_deploy.py --study branching --jobs 2 # trees that branch at none, one and two stages
     python experiments/cstr_deploy.py --plot-only                # redraw from the committed CSV
 
 Writes results/cstr_deploy.csv (a row per controller and draw), figures/cstr_deploy.png and cstr_deploy_full.png; the other studies write
@@ -27,42 +28,51 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
 import cstr_loops as loops
-import cstr_tune
+from cstr_tune import TUNED, TUNED_IPOPT
 
 import rl_mpc_deploy as deploy
 
 PAPER, AWARE = dict(critic=loops.ROBUST), dict(critic=loops.CONSTRAINED)
 ACTOR, RL_MPC = dict(controllers=("actor",)), dict(controllers=("rl_mpc",))
-TUNED = cstr_tune.settings(prices=(0.1, 1.0), change=0.1, horizon=40)  # best of cstr_tune.py
+ROBUST, IPOPT, ONE = dict(controllers=("robust_mpc",)), dict(like="ipopt"), dict(iterations=1)
 HORIZONS = (0, 1, 2, 5, 10)
+DRAWS = {"deploy": 200, "branching": 20}  # else 50
 STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
     "deploy": {
         "nominal MPC, N = 20": dict(controllers=("nominal_mpc",)),
-        "robust MPC, N = 20": dict(controllers=("robust_mpc",)),
-        "robust MPC, tuned, N = 40": dict(controllers=("robust_mpc",), benchmark=TUNED),
+        "robust MPC, N = 20": ROBUST,
+        "robust MPC, tuned": ROBUST | dict(benchmark=TUNED),
         "goal-conditioned MPC, N = 5": dict(controllers=("goal_mpc",), slack_weight=2.0),
         "RL, paper's": ACTOR | PAPER,
         **{f"RL+MPC, paper's, N = {n}": RL_MPC | PAPER | dict(horizon=n) for n in HORIZONS},
+        "RL+MPC, paper's, N = 5, one iteration": RL_MPC | PAPER | ONE,
         "RL, constraint-aware": ACTOR | AWARE,
         **{f"RL+MPC, constraint-aware, N = {n}": RL_MPC | AWARE | dict(horizon=n) for n in HORIZONS},
+        "RL+MPC, constraint-aware, N = 5, one iteration": RL_MPC | AWARE | ONE,
         "RL+MPC, constraint-aware, N = 5, hard": RL_MPC | AWARE | dict(constraints="hard"),
+    },
+    "ipopt": {
+        "nominal MPC, N = 20, IPOPT": dict(controllers=("nominal_mpc",)) | IPOPT,
+        "robust MPC, N = 20, IPOPT": ROBUST | IPOPT,
+        f"robust MPC, tuned, N = {dict(TUNED_IPOPT).get('horizon', 20)}, IPOPT": ROBUST | IPOPT | dict(benchmark=TUNED_IPOPT),
+        "RL+MPC, constraint-aware, N = 5, IPOPT": RL_MPC | AWARE | IPOPT,
+        "RL+MPC, constraint-aware, N = 5, hard, IPOPT": RL_MPC | AWARE | IPOPT | dict(constraints="hard"),
     },
     "literal": {
         f"{title}, N = {n}": RL_MPC | PAPER | dict(horizon=n) | options
         for n in (1, 2, 5)
         for title, options in {
-            "this repository": {},
-            "slack summed over scenarios": dict(slack_weight=9.0),
+            "this repository's problem": IPOPT,
+            "slack summed over scenarios": IPOPT | dict(slack_weight=9.0),
             "sum as printed": dict(like="printed"),
             "as in the authors' stack": dict(like="literal"),
         }.items()
     },
-    "expansion": {
-        title: RL_MPC | PAPER | dict(value=value)
-        for title, value in {"exact value": "exact", "expanded at the settled state": "taylor", "re-expanded": "taylor-local"}.items()
+    "branching": {
+        f"RL+MPC, constraint-aware, N = 5, robust horizon {stages}": RL_MPC | AWARE | dict(robust_horizon=stages) for stages in (0, 1, 2)
     },
 }
-MAIN = ["robust MPC, N = 20", "robust MPC, tuned, N = 40", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
+MAIN = ["robust MPC, N = 20", "robust MPC, tuned", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
         "RL+MPC, constraint-aware, N = 5"]  # fmt: skip
 KINDS = {"paper's": (), "constraint-aware": ("--constraint-weight", "3")}  # of agents, how they are trained
 MEASURES = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
@@ -70,11 +80,11 @@ MEASURES = {"time_near_goal": "time near goal [steps]", "time_outside_constraint
 
 @dataclass
 class Args:
-    study: Literal["deploy", "critics", "literal", "expansion"] = "deploy"
-    """deploy: the controllers against each other; critics: of other training seeds; literal: conventions of the authors' code; expansion:
-    the learned value's second-order expansions"""
+    study: Literal["deploy", "critics", "ipopt", "literal", "branching"] = "deploy"
+    """deploy: the controllers against each other; critics: of other training seeds; ipopt: by another solver; literal: conventions of the
+    authors' code; branching: trees that branch at more stages"""
     episodes: int | None = None
-    """paired draws; default: 200, in the other studies 50"""
+    """paired draws; default: 200, of branching 20, in the other studies 50"""
     seed: int = 0
     """seed of the draws"""
     jobs: int = 2
@@ -107,18 +117,19 @@ def summary(rows):
 
 
 def print_table(rows):
-    print(f"{'':40s}{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}{'solve ms':>16s}{'failed':>8s}")
+    measures = f"{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}"
+    print(f"{'':48s}{measures}{'solve ms':>16s}{'iterations':>12s}{'steps':>10s}")
     titles = f"{'median':>9s}{'5 %-ile':>8s}{'worst':>8s}"
-    print(f"{'':40s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'solves':>8s}")
+    print(f"{'':48s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'per step':>12s}{'unsolved':>10s}")
     for label in dict.fromkeys(row["variant"] for row in rows):
-        text = f"{label:40s}"
+        text = f"{label:48s}"
         for key in MEASURES:
             found = loops.values(rows, label, key)
             text += f"{np.median(found):9.1f}{np.quantile(found, 0.05):8.1f}{found.min():8.1f}   "
-        offset, median, p95, failed = (
-            loops.values(rows, label, k) for k in ("ape_tail", "solve_ms_median", "solve_ms_p95", "solver_failures")
-        )
-        print(f"{text[:-3]}{found.mean():9.1f}{np.median(offset):9.2f}{np.median(median):8.1f}{np.median(p95):8.1f}{failed.sum():8.0f}")
+        columns = ("ape_tail", "solve_ms_median", "solve_ms_p95", "iterations", "unsolved")
+        offset, median, p95, iterations, unsolved = (loops.values(rows, label, key) for key in columns)
+        text = f"{text[:-3]}{found.mean():9.1f}{np.median(offset):9.2f}{np.median(median):8.1f}{np.median(p95):8.1f}"
+        print(f"{text}{iterations.mean():12.1f}{unsolved.sum():10.0f}")
 
 
 def figure(rows, labels, path):
@@ -142,7 +153,7 @@ def main(args):
     cells.check(args, f"{name}.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     table = args.out / f"results/{name}.csv"
     if not args.plot_only:
-        rows = loops.collect(variants(args), args, args.episodes or (200 if args.study == "deploy" else 50))
+        rows = loops.collect(variants(args), args, args.episodes or DRAWS.get(args.study, 50))
         cells.write(loops.table(rows), table)
     rows = cells.read(table)
     print_table(rows)

@@ -35,7 +35,7 @@ CURVES = {  # label: (colour, marker, keywords of cstr_loops)
 POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
     "nominal MPC, N = 20": ("#999999", "P", "nominal MPC"),
     "robust MPC, N = 20": ("#999999", "X", "robust MPC"),
-    "robust MPC, tuned, N = 40": ("#999999", "*", "robust MPC, tuned, N = 40"),
+    "robust MPC, tuned": ("#999999", "*", "robust MPC, tuned"),
     "goal-conditioned MPC, N = 5": ("#E69F00", "P", "goal-conditioned MPC, N = 5"),
     "RL, constraint-aware": ("#D55E00", "^", "RL, constraint-aware"),
     "RL+MPC, constraint-aware, N = 0": ("#009E73", "P", "RL+MPC, N = 0"),

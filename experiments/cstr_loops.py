@@ -25,27 +25,26 @@ import literal
 import torch
 
 import envs
+import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.tools.expansion import expansion
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
 # what rows depend on, read when it is imported: an edit while loops run does not file old results under new code
-INPUTS = [Path(module).read_bytes() for module in (__file__, literal.__file__, deploy.__file__, envs.__file__, cstr.__file__)]
+INPUTS = [Path(module.__file__).read_bytes() for module in (sys.modules[__name__], literal, deploy, gm, envs, cstr)]
 BLOCK = 25  # draws per cell
 
 
 class OneStart(deploy.ScenarioMPC):
-    """Starts each solve from the shifted last plan alone: the actor gives the first guess of an episode, and is no fallback after it."""
+    """Improves the shifted last plan alone: the actor gives the first guess of an episode, and none after it."""
 
-    def make_step(self, x0):
-        actor, self.actor = self.actor, self.actor if self.plan is None else None
-        try:
-            return super().make_step(x0)
-        finally:
-            self.actor = actor
+    def _guesses(self, x):
+        found = super()._guesses(x)
+        return {"shifted": found["shifted"]} if "shifted" in found else found
 
 
-CLASSES = {"": deploy.ScenarioMPC, "literal": literal.LiteralMPC, "printed": literal.PrintedMPC, "one start": OneStart}
+KINDS = {"ipopt": literal.IpoptMPC, "literal": literal.LiteralMPC, "printed": literal.PrintedMPC}
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Loop:
     first: int
     stop: int
     like: str = ""
-    """a key of CLASSES; literal: the authors' conventions, printed: eq:QMPC's sum"""
+    """a key of KINDS, by IPOPT; literal: the authors' conventions, printed: eq:QMPC's sum; or "one start" """
     benchmark: tuple = ()
     """items that replace those of the plant's BENCHMARK"""
     shift: float | None = None
@@ -73,12 +72,15 @@ def checksum(path):
 
 
 def loops(variants, episodes, seed, quick=False):
-    """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}. Quick: 2 draws of 3 steps, not compiled."""
+    """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}. Quick: 2 draws of 3 steps, benchmarks of N = 3,
+    not compiled."""
     own, found = ("like", "benchmark", "shift"), []
     episodes, steps = (2, 3) if quick else (episodes, 100)
     for first in range(0, episodes, BLOCK):
         for label, options in variants.items():
             options = {"horizon": 5, "seed": seed, "steps": steps, "jobs": 1, "compile": not quick} | options
+            if quick:
+                options["benchmark"] = (*options.get("benchmark", ()), ("horizon", 3))
             args = deploy.Args(**{k: v for k, v in options.items() if k not in own})
             key = f"{checksum(deploy.critic_path(args))} {replace(args, critic=None)}"
             stop = min(first + BLOCK, episodes)
@@ -86,12 +88,47 @@ def loops(variants, episodes, seed, quick=False):
     return found
 
 
+def one_start(settings):
+    """RL+MPC whose planner is a `OneStart`."""
+    plant, goal, critic = deploy.check(settings)
+    mu, _, V = deploy.export(critic)
+    options = dict(slack_price=settings.slack_weight, iterations=settings.iterations, compile=settings.compile)
+    options |= dict(goal=goal, policy=mu, expansion=expansion(critic))
+    return OneStart(plant, settings.horizon, plant.SCENARIOS["mpc"], literal.gaussian(plant), V, **options)
+
+
 @functools.cache
 def controller(settings, like, benchmark):
     torch.set_num_threads(1)
-    replaced = {name: np.array(value) if isinstance(value, tuple) else value for name, value in benchmark}
-    with mock.patch.object(deploy, "ScenarioMPC", CLASSES[like]), mock.patch.dict(cstr.BENCHMARK, replaced):
-        return deploy.build_controller(settings.controllers[0], settings)
+    name, replaced = settings.controllers[0], {key: np.array(value) if isinstance(value, tuple) else value for key, value in benchmark}
+    with mock.patch.dict(cstr.BENCHMARK, replaced):
+        if like in KINDS:
+            return literal.build_controller(name, settings, KINDS[like])
+        return one_start(settings) if like else deploy.build_controller(name, settings)
+
+
+class Recorder:
+    """A controller that keeps the statistics of its steps."""
+
+    def __init__(self, controller):
+        self.controller, self.log = controller, []
+
+    def reset(self):
+        self.controller.reset()
+
+    def make_step(self, x0):
+        u = self.controller.make_step(x0)
+        self.stats = self.controller.stats
+        self.log.append(self.stats)
+        return u
+
+    def counts(self):
+        """Steps whose quadratic program was unsolved, or IPOPT's first solve; steps that ended at the limit of iterations; and how far from
+        stationary they ended: 95th percentile of the last predicted decrease as a share of the cost."""
+        predicted = [stats.get("predicted", 0.0) / (1 + abs(stats.get("cost", 0.0))) for stats in self.log]
+        return {"unsolved": sum(stats.get("stop") == "unsolved" or not stats.get("success", True) for stats in self.log),
+                "limit": sum(stats.get("stop") == "limit" for stats in self.log),
+                "predicted_p95": np.quantile(predicted, 0.95)}  # fmt: skip
 
 
 def shifted_plants(episodes, seed, factor):
@@ -109,23 +146,30 @@ def slack(x):
     return np.abs(x - np.clip(x, cstr.X_LOW, cstr.X_HIGH))[1:].sum()
 
 
+def slack_weight(mpc):
+    """Price of a concentration below its bound, mol/l; infinite: a hard bound."""
+    if isinstance(mpc, gm.ScenarioMPC):
+        return float(mpc.slack_price[0, 0])
+    price = mpc.slack_price[0, 0] / mpc.x_scale[0] if isinstance(mpc, deploy.ScenarioMPC) else 0.0
+    return round(float(price), 6)
+
+
 def run(loop):
-    """A row per draw: labels, the metrics of rl_mpc_deploy.py, `slack`, and the actions as JSON."""
+    """A row per draw: labels, the metrics of rl_mpc_deploy.py, `Recorder.counts`, `slack`, and the actions as JSON."""
     args, mpc = loop.settings, controller(loop.settings, loop.like, loop.benchmark)
     starts, psi = deploy.draws(cstr, loop.stop, args.seed)
     if loop.shift is not None:
         psi = shifted_plants(loop.stop, args.seed, loop.shift)
-    # of a lower bound on a concentration; infinite: hard
-    weight, critic = getattr(mpc, "slack_price", np.zeros((1, 1))), deploy.critic_path(args)
-    head = {"variant": loop.variant, "controller": args.controllers[0], "horizon": getattr(mpc, "horizon", 0),
-            "slack_weight": float(weight[0, 0]), "critic": critic.stem if critic.parent == ROBUST.parent else critic.parent.name,
-            "seed": args.seed}  # fmt: skip
+    critic = deploy.critic_path(args)
+    head = {"variant": loop.variant, "controller": args.controllers[0], "horizon": mpc.horizon or 0, "slack_weight": slack_weight(mpc),
+            "critic": critic.stem if critic.parent == ROBUST.parent else critic.parent.name, "seed": args.seed}  # fmt: skip
     rows = []
     for episode in range(loop.first, loop.stop):
-        x, u, row = deploy.run_episode(mpc, cstr, starts[episode], psi[episode], mpc.goal, args.steps)
+        recorder = Recorder(mpc)
+        x, u, row = deploy.run_episode(recorder, cstr, starts[episode], psi[episode], np.array(args.goal or cstr.EVAL_GOAL), args.steps)
+        row |= recorder.counts() | {"slack": slack(x)}
         row = {k: round(float(v), 6) if isinstance(v, float) else v for k, v in row.items()}
-        rows.append(head | {"episode": episode, "psi": json.dumps(psi[episode].tolist())} | row
-                    | {"slack": round(float(slack(x)), 6), "actions": json.dumps(u.tolist())})  # fmt: skip
+        rows.append(head | {"episode": episode, "psi": json.dumps(psi[episode].tolist())} | row | {"actions": json.dumps(u.tolist())})
     return rows
 
 

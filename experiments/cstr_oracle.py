@@ -31,11 +31,13 @@ sys.path.insert(0, str(HERE.parent))
 import cells
 import cstr_deploy
 import cstr_loops as loops
+import literal
 from cstr_deploy import summary
 
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.tools.comparison import METRIC_SIGMA2
 
 WEIGHTS, FRONTIER = (1.0, 5.0), (0.3, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0)
 FRONTIER_DRAWS = 50
@@ -72,27 +74,34 @@ def known_plant():
     wide = {"X_LOW": -np.inf, "X_HIGH": np.inf, "INIT_LOW": 0.0, "INIT_HIGH": 2.0}
     bounds = {name: np.append(getattr(cstr, name), np.full(N_PSI, value)) for name, value in wide.items()}
     bounds["MODEL_SUBSTEPS"] = 8  # those of `cstr.step`
-    return SimpleNamespace(**{k: v for k, v in vars(cstr).items() if k.isupper()} | bounds, ode=ode)
+    return SimpleNamespace(**{k: v for k, v in vars(cstr).items() if k.isupper()} | bounds, ode=ode, goal_error=cstr.goal_error)
 
 
-class Oracle(deploy.ScenarioMPC):
+class Oracle(literal.IpoptMPC):
     """The problem over a whole episode; the plan is replayed on the plant, so that its figures are those of a controller's row."""
 
     def __init__(self, steps, compile):
-        x, goal = ca.MX.sym("x", N_X + N_PSI), ca.MX.sym("goal", 1)
-        near = ca.exp(-ca.sumsqr(x[cstr.GOAL_INDEX] - goal) / (2 * deploy.METRIC_SIGMA2))
-        stage = ca.Function("stage", [x, goal], [-near])
-        super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, robust_horizon=0, compile=compile)
+        price = np.repeat([1.0, 0.0], [N_X, N_PSI])  # times the weight
+        stage = literal.gaussian(known_plant(), METRIC_SIGMA2)
+        super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, slack_price=price, compile=compile)
+
+    def _build_problem(self):
+        """The price of slack is a parameter: a problem serves every weight."""
+        super()._build_problem()
+        weight, at = ca.MX.sym("weight"), self.positions("slack")  # (bounds, steps)
+        slack = ca.reshape(self.nlp["x"][at.ravel("F").tolist()], *at.shape)
+        cost = ca.sum2(ca.DM(self.x_scale[np.concatenate(self.soft)]).T @ slack)
+        self.nlp |= {"f": self.nlp["f"] + (weight - 1) * cost, "p": ca.vertcat(self.nlp["p"], weight)}
 
     def solve(self, x0, psi, weight, guess):
         """Actions (steps, n_u) that one solve from the actions `guess`, or from the held state (None), ends with; None if it fails."""
-        start = np.append(x0, psi)
-        price = np.full((2, N_X + N_PSI), weight)
-        price[:, N_X:] = 0.0
-        w = self.hold_guess(start) if guess is None else self._rollout(start, lambda t, x: guess[t][:, None])
-        self.stats = {"iterations": 0}
-        solution = self._solve("cold", start, price, w)
-        return solution and np.array([self.physical(solution[0], "u", t)[:, 0] for t in range(self.horizon)])
+        start, solver = np.append(x0, psi), self.solvers["cold"]
+        w = self.hold_guess(start) if guess is None else self.tree_guess(start, lambda t, x: guess[t])
+        result = solver(x0=w, p=np.concatenate([start, self.u_before, self.goal.ravel("F"), [weight]]), **self.bounds)
+        self.last_objective, found = float(result["f"]), np.array(result["x"]).ravel()
+        if not solver.stats()["success"] or not np.isfinite(self.last_objective):
+            return None
+        return np.array([self.physical(found, "u", t)[:, 0] for t in range(self.horizon)])
 
 
 @functools.cache
@@ -106,8 +115,8 @@ def measure(x0, psi, u):
     for action in u:
         x.append(cstr.step(x[-1], np.clip(action, cstr.U_LOW, cstr.U_HIGH), psi))
     x = np.array(x)
-    near = envs.goal_reward(cstr, x[1:, cstr.GOAL_INDEX], cstr.EVAL_GOAL, sigma2=deploy.METRIC_SIGMA2).sum()
-    return near, envs.outside_constraints(cstr, x[1:], deploy.METRIC_SIGMA2).sum(), loops.slack(x)
+    near = envs.goal_reward(cstr, x[1:, cstr.GOAL_INDEX], cstr.EVAL_GOAL, sigma2=METRIC_SIGMA2).sum()
+    return near, envs.outside_constraints(cstr, x[1:], METRIC_SIGMA2).sum(), loops.slack(x)
 
 
 def best(cell):
@@ -192,7 +201,7 @@ def check_goal(found, controllers, variant):
         ("outside, median, less the oracle's: -0.5 at least", outside - kept, -0.5),
         ("outside, 5th percentile, less the oracle's: -5 at least", outside_low - kept_low, -5.0),
     ]
-    for benchmark in ("robust MPC, N = 20", "robust MPC, tuned, N = 40"):
+    for benchmark in ("robust MPC, N = 20", "robust MPC, tuned"):
         (other, other_low), (bounds, bounds_low) = summary([row for row in controllers if row["variant"] == benchmark])
         lines += [
             (f"near goal, median, less that of {benchmark}", near - other, 0.0),

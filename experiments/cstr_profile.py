@@ -61,7 +61,7 @@ def profile(name, args):
     psi, steps = np.array([args.alpha, args.beta]), 5 if args.quick else args.steps
     x, u, row = deploy.run_episode(controller, cstr, np.array(args.start), psi, controller.goal, steps)
     print(name, {key: round(float(value), 2) for key, value in row.items()})
-    head = {"controller": name, "horizon": getattr(controller, "horizon", 0), "goal": args.goal, "alpha": args.alpha, "beta": args.beta}
+    head = {"controller": name, "horizon": controller.horizon or 0, "goal": args.goal, "alpha": args.alpha, "beta": args.beta}
     return [head | {"step": t} | dict(zip(cstr.STATE_NAMES + cstr.ACTION_NAMES, [*x[t], *u[min(t, steps - 1)]])) for t in range(steps + 1)]
 
 

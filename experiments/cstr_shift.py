@@ -41,7 +41,7 @@ FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0)
 CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)
     "nominal MPC, N = 20": ("#999999", ":", dict(controllers=("nominal_mpc",))),
     "robust MPC, N = 20": ("#0072B2", "-.", dict(controllers=("robust_mpc",))),
-    "robust MPC, tuned, N = 40": ("#56B4E9", (0, (5, 1)), dict(controllers=("robust_mpc",), benchmark=TUNED)),
+    "robust MPC, tuned": ("#56B4E9", (0, (5, 1)), dict(controllers=("robust_mpc",), benchmark=TUNED)),
     "goal-conditioned MPC, N = 5": ("#E69F00", (0, (3, 1, 1, 1)), dict(controllers=("goal_mpc",), slack_weight=2.0)),
     "RL, paper's": ("#CC79A7", "--", ACTOR | PAPER),
     "RL, constraint-aware": ("#D55E00", "--", ACTOR | AWARE),
@@ -150,7 +150,7 @@ def critic(args):
     variants = {name: {label: kind | dict(critic=path) for label, kind in kinds.items()} for name, path in CRITICS.items()}
     visited, rows = {name: loops.collect(own, args) for name, own in variants.items()}, []  # before torch computes: no fork after it
     for name, path in CRITICS.items():
-        value = deploy.load_critic(path, "cstr").value
+        V = deploy.export(deploy.load_critic(path, "cstr"))[2]
         for label in kinds:
             rng, found = np.random.default_rng(args.seed), []
             for row in visited[name]:
@@ -159,9 +159,7 @@ def critic(args):
                     times = rng.choice(len(states), size=min(20, len(states)), replace=False)
                     found += [(int(row["episode"]), int(t), *states[t]) for t in sorted(times)]
             found = np.array(found)
-            with torch.no_grad():
-                goal = torch.tensor(cstr.EVAL_GOAL).expand(len(found), -1)
-                learned = value(torch.tensor(found[:, 2:]), goal).numpy()
+            learned = np.array(V(found[:, 2:].T, cstr.EVAL_GOAL)).ravel()
             simulated, outside = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng)
             for (episode, t, *state), v, mc, out in zip(found, learned, simulated, outside):
                 rows.append({"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}

@@ -1,10 +1,10 @@
-"""The robust benchmark MPC with its weights tuned, so that RL+MPC is not compared with a straw man.
+"""The robust benchmark MPC with its weights tuned, under both solvers, so that RL+MPC is not compared with a straw man.
 
-    python experiments/cstr_tune.py --jobs 2        # a quarter of an hour; continues where it stopped
+    python experiments/cstr_tune.py --jobs 2        # three quarters of an hour; continues where it stopped
 
 A grid over the prices of soft constraints (every bound soft, where the published benchmark has hard ones), the penalty of input changes and
-the horizon, on draws of their own. The best, by the sum of the paper's two measures, is `TUNED` in cstr_deploy.py. Writes
-results/cstr_tune.csv, a row per setting, and prints it in order.
+the horizon, on draws of their own, by the planner of rl_mpc_deploy.py and by IPOPT. The best of each, by the sum of the paper's two
+measures, is `TUNED` or `TUNED_IPOPT`. Writes results/cstr_tune.csv, a row per setting, and prints it in order.
 """
 
 import sys
@@ -21,13 +21,8 @@ import cstr_loops as loops
 
 from envs import cstr
 
-PRICES = (
-    (0.01, 1.0),
-    (0.03, 1.0),
-    (0.1, 1.0),
-    (1.0, 1.0),
-    (10.0, 10.0),
-)  # per mol/l and per degC, summed over scenarios as the published ones
+# per mol/l and per degC, summed over scenarios as the published ones
+PRICES = ((0.01, 1.0), (0.03, 1.0), (0.1, 1.0), (1.0, 1.0), (10.0, 10.0))
 CHANGES = (1.0, 0.1)  # times the published weights
 
 
@@ -61,25 +56,33 @@ def settings(prices, change, horizon):
 
 GRID = {"published": ()} | {
     f"{prices[0]:g} per mol/l, {prices[1]:g} per degC, changes x {change:g}, N = {horizon}": settings(prices, change, horizon)
-    for prices, change, horizon in [(p, change, 20) for p in PRICES for change in CHANGES] + [(p, 0.1, 40) for p in PRICES[1:4]]
+    for prices, change, horizon in [(p, change, 20) for p in PRICES for change in CHANGES] + [(p, 0.1, 40) for p in PRICES]
 }
+SOLVERS = {"anytime": "", "IPOPT": "ipopt"}  # name in the table: `like` of cstr_loops.py
+TUNED = settings(prices=(1.0, 1.0), change=0.1, horizon=40)
+TUNED_IPOPT = settings(prices=(0.1, 1.0), change=0.1, horizon=40)
 
 
 def main(args):
     cells.check(args, "cstr_tune.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     table = args.out / "results/cstr_tune.csv"
     if not args.plot_only:
-        variants = {label: dict(controllers=("robust_mpc",), benchmark=benchmark) for label, benchmark in GRID.items()}
-        variants = dict(list(variants.items())[:2]) if args.quick else variants
+        grid = dict(list(GRID.items())[:2]) if args.quick else GRID
+        variants = {f"{label} | {solver}": dict(controllers=("robust_mpc",), benchmark=benchmark, like=like)
+                    for solver, like in SOLVERS.items() for label, benchmark in grid.items()}  # fmt: skip
         rows, found = loops.collect(variants, args), []
         for label in variants:
-            near, outside = (loops.values(rows, label, k) for k in ("time_near_goal", "time_outside_constraints"))
-            found.append({"variant": label, "draws": len(near), "near_median": np.median(near), "near_mean": near.mean(),
+            columns = ("time_near_goal", "time_outside_constraints", "solve_ms_median")
+            near, outside, ms = (loops.values(rows, label, column) for column in columns)
+            variant, solver = label.split(" | ")
+            found.append({"solver": solver, "variant": variant, "draws": len(near),
+                          "near_median": np.median(near), "near_mean": near.mean(),
                           "near_p5": np.quantile(near, 0.05), "outside_median": np.median(outside), "outside_mean": outside.mean(),
-                          "outside_p5": np.quantile(outside, 0.05), "score": (near + outside).mean()})  # fmt: skip
+                          "outside_p5": np.quantile(outside, 0.05), "score": (near + outside).mean(), "ms": np.median(ms)})  # fmt: skip
         cells.write([{k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in found], table)
     for row in sorted(cells.read(table), key=lambda row: -float(row["score"])):
-        print(row.pop("variant").ljust(52), *(f"{key} {float(value):.1f}" for key, value in row.items()), sep="  ")
+        head = f"{row.pop('solver'):8s}{row.pop('variant'):52s}"
+        print(head, *(f"{key} {float(value):.1f}" for key, value in row.items()), sep="  ")
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""Figure `norm_profile`: the learned value in goal-conditioned MPC on ten random linear systems with 32 states, and its fast variants.
+"""Figure `norm_profile`: the learned value in goal-conditioned MPC on ten random linear systems with 32 states, and its fast variant.
 
     python experiments/linear_value_mpc.py --study train --jobs 2    # forty minutes: an agent per system; continues where it stopped
     python experiments/linear_value_mpc.py                           # the closed loops; one process, so that solve times mean something
-    python experiments/linear_value_mpc.py --study distance          # how far from the goal the fast variants stay valid
+    python experiments/linear_value_mpc.py --study distance          # how far from the goal the fast variant stays valid
     python experiments/linear_value_mpc.py --study scaling           # solve time against n and against the horizon
     python experiments/linear_value_mpc.py --study profile --plot-only
 
 The agents are those of `python sac_her_branching.py --env linear --dim 32 --system 0 --seed 0`, and of 1 to 9; the scaling study has one
 more for each smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a
-price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, or an expansion of -V about the goal (taylor) or about
-where the first guess ends (taylor-local). Beside them the goal-conditioned MPC of linear_scalability.py, whose costs contain the input
-and whose terminal cost is the regulator's.
+price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, with as many iterations as needed or with one, or the
+paper's fast variant, -V expanded about the goal to second order (`taylor_value`). Beside them the goal-conditioned MPC of
+linear_scalability.py, whose costs contain the input and whose terminal cost is the regulator's.
 
 Writes results/linear_value_mpc_NAME.csv for NAME in training, profile, distance, times, linear_value_mpc.csv (a row per closed loop of the
 profile study), and the figures linear_value_mpc.png, linear_value_mpc_distance.png and linear_value_mpc_times.png.
@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import casadi as ca
 import matplotlib
 import numpy as np
 import tyro
@@ -43,14 +44,17 @@ import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import linear
+from envs.tools.comparison import METRIC_SIGMA2
+from envs.tools.expansion import expansion
+from envs.tools.tree_qp import positive_part
 
 CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None for goal_mpc.py)
     "RL (actor alone)": ("#D55E00", "--", dict(controllers=("actor",))),
     "goal-conditioned MPC, regulator's value": ("#999999", ":", None),
     "goal-conditioned MPC, no value": ("#E69F00", "-.", dict(controllers=("goal_mpc",))),
-    "RL+MPC": ("#009E73", "-", dict(controllers=("rl_mpc",), value="exact")),
-    "RL+MPC, taylor": ("#0072B2", (0, (5, 1)), dict(controllers=("rl_mpc",), value="taylor")),
-    "RL+MPC, taylor-local": ("#CC79A7", (0, (3, 1, 1, 1)), dict(controllers=("rl_mpc",), value="taylor-local")),
+    "RL+MPC": ("#009E73", "-", dict(controllers=("rl_mpc",))),
+    "RL+MPC, one iteration": ("#CC79A7", (0, (3, 1, 1, 1)), dict(controllers=("rl_mpc",), iterations=1)),
+    "RL+MPC, taylor": ("#0072B2", (0, (5, 1)), dict(controllers=("rl_mpc",))),
 }
 SCALING_DIMENSIONS, SCALING_HORIZONS = (2, 4, 8, 16), (2, 5, 10, 20, 40)  # beside --dim
 DISTANCE_HORIZONS, DISTANCES = (1, 2, 5, 10), (0.1, 0.3, 1.0, 2.0, 3.0)
@@ -154,19 +158,40 @@ def train_all(args):
 # Closed loops
 
 
-def build(label, dim, system, horizon, critic):
+def taylor_value(critic):
+    """CasADi function (x, goal) -> V expanded to second order about the goal, which names every state.
+
+    -V need not be convex, and a quadratic that is not has its minimum at the end of the world: negative eigenvalues of its Hessian, in
+    units of the box of initial states, become zero.
+    """
+    center, scale = critic.plant.EVAL_GOAL, critic.scaling["x_scale"]
+    x, goal = ca.MX.sym("x", len(center)), ca.MX.sym("goal", len(center))
+    value, gradient, hessian = (np.array(part) for part in expansion(critic)(center, center, 0 * center))
+    curvature = positive_part(-hessian * np.outer(scale, scale))
+    away = (x - goal) / scale
+    expanded = value + ca.dot(gradient.ravel() * scale, away) - ca.bilin(curvature, away, away) / 2
+    return ca.Function("taylor", [x, goal], [expanded])
+
+
+def build(label, dim, system, horizon, critic, compile=True):
     """A controller of the figure for one system."""
     settings = CONTROLLERS[label][2]
     if settings is None:
         return gm.build_controller(gm.Args(env="linear", dim=dim, system=system, horizon=horizon, slack_weight=1.0, compile=False))
-    settings = deploy.Args(env="linear", critic=critic, horizon=horizon, compile=False, **settings)
-    return deploy.build_controller(settings.controllers[0], settings)
+    settings = deploy.Args(env="linear", critic=critic, horizon=horizon, compile=compile, **settings)
+    if label != "RL+MPC, taylor":
+        return deploy.build_controller(settings.controllers[0], settings)
+    critic = deploy.load_critic(critic, "linear")
+    plant, mu = critic.plant, deploy.export(critic)[0]
+    x, goal = ca.MX.sym("x", dim), ca.MX.sym("goal", dim)
+    stage = ca.Function("stage", [x, goal], [-ca.exp(-ca.sumsqr(x - goal) / (2 * plant.MPC_SIGMA2))])
+    return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], stage, taylor_value(critic), goal=plant.EVAL_GOAL, policy=mu,
+                              compile=compile)  # fmt: skip
 
 
 def run_loop(controller, plant, x0, steps):
     """Closed loop from x0: states (steps + 1, n) and the controller's stats of every step."""
     controller.reset()
-    controller.set_initial_guess(x0)
     x, log = [x0], []
     for _ in range(steps):
         x.append(plant.step(x[-1], controller.make_step(x[-1])))
@@ -174,17 +199,23 @@ def run_loop(controller, plant, x0, steps):
     return np.array(x), log
 
 
+def failed(stats):
+    """Whether a step had no plan or left a problem unsolved."""
+    return not stats["success"] if "success" in stats else stats["fell_back"] or stats.get("stop") == "unsolved"
+
+
 def measures(plant, x, log):
     """The measures of linear_scalability.py, and solve times."""
     milliseconds = [s["wall_ms"] for s in log]
     return {
-        "steps_not_near": len(log) - envs.goal_reward(plant, x[1:], plant.EVAL_GOAL, sigma2=deploy.METRIC_SIGMA2).sum(),
+        "steps_not_near": len(log) - envs.goal_reward(plant, x[1:], plant.EVAL_GOAL, sigma2=METRIC_SIGMA2).sum(),
         "l2_error": np.sqrt((x[1:] ** 2).sum()),
         "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
         "final_norm": np.linalg.norm(x[-1]),
         "solve_ms_median": np.median(milliseconds), "solve_ms_p95": np.quantile(milliseconds, 0.95), "solve_ms_max": max(milliseconds),
         "solve_ms_transient": np.mean(milliseconds[:5]),
-        "iterations": sum(s.get("iterations", 0) for s in log), "solver_failures": sum(not s["success"] for s in log),
+        "iterations": sum(s.get("iterations", 0) for s in log),
+        "solver_failures": sum(map(failed, log)),
     }  # fmt: skip
 
 
@@ -195,9 +226,9 @@ def start_states(dim, system, starts):
 
 def run_cell(cell):
     """One controller on one system from every start, at one horizon and at some distances: rows, each with its profile as text."""
-    label, dim, system, horizon, scales, starts, steps, critic, jobs = cell
+    label, dim, system, horizon, scales, starts, steps, critic, jobs, compile = cell
     torch.set_num_threads(1)
-    controller, (plant, x0s) = build(label, dim, system, horizon, Path(critic)), start_states(dim, system, starts)
+    controller, (plant, x0s) = build(label, dim, system, horizon, Path(critic), compile), start_states(dim, system, starts)
     rows = []
     for scale in scales:
         for i, x0 in enumerate(x0s):
@@ -220,7 +251,18 @@ def without(row, *keys):
 
 def collect(args, labels, horizons, scales):
     work = [
-        (label, args.dim, system, horizon, scales, args.starts, args.steps, str(checkpoint(args, args.dim, system)), args.jobs)
+        (
+            label,
+            args.dim,
+            system,
+            horizon,
+            scales,
+            args.starts,
+            args.steps,
+            str(checkpoint(args, args.dim, system)),
+            args.jobs,
+            not args.quick,
+        )
         for horizon in horizons
         for label in labels
         if not (label == "RL (actor alone)" and horizon != horizons[0])
@@ -255,7 +297,9 @@ def plot_profile(args):
     baseline = {}
     print(f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}{'ms median':>11s}"
           f"{'first 5':>9s}{'worst':>8s}{'failed':>8s}")  # fmt: skip
-    for label, (colour, dashes, _) in CONTROLLERS.items():
+    labels = [label for label in CONTROLLERS if any(row["controller"] == label for row in curves)]
+    for label in labels:
+        colour, dashes, _ = CONTROLLERS[label]
         mine = {key: np.array([row[key] for row in curves if row["controller"] == label]).astype(float) for key in list(curves[0])[1:]}
         for ax, key, floor in zip(axes, ("norm", "ms"), (1e-3, 0)):
             if key == "norm" or "actor" not in label:
@@ -274,11 +318,11 @@ def plot_profile(args):
         worst, failed = mine["solve_ms_max"].max(), mine["solver_failures"].sum()
         print(f"{label:42s}{spread}{violation:10.2f}{end:9.4f}{milliseconds:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}")
     plain = baseline["goal-conditioned MPC, no value"]
-    for label in list(CONTROLLERS)[3:]:
+    for label in labels[3:]:
         print(f"{label}: solve time over that without a value, median {baseline[label]['solve_ms_median'] / plain['solve_ms_median']:.2f}, "
               f"first five steps {baseline[label]['solve_ms_transient'] / plain['solve_ms_transient']:.2f}")  # fmt: skip
     actor = paired(rows, "RL (actor alone)")
-    for label in list(CONTROLLERS)[1:]:
+    for label in labels[1:]:
         gain = actor - paired(rows, label)
         print(f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}")
     axes[0].set(ylabel="|x|, below 0.001 drawn there", yscale="log", xlim=(0, 12))
@@ -343,7 +387,7 @@ def scaling(args):
     dimensions, horizons = scaling_dimensions(args), SCALING_HORIZONS[: 2 if args.quick else None]
     starts, steps, rows = min(args.starts, 5), min(args.steps, 20), []
     for axis, pairs in (("n", [(n, args.horizon) for n in dimensions]), ("horizon", [(dimensions[-1], N) for N in horizons])):
-        work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)), args.jobs)
+        work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)), args.jobs, not args.quick)
                 for n, N in pairs for label in CONTROLLERS if "actor" not in label]  # fmt: skip
         found = cells.collect(run_cell, work, args.jobs, args.runs / "scaling", inputs())
         rows += [{"axis": axis} | without(row, "norms", "times") for row in found]
@@ -353,7 +397,7 @@ def scaling(args):
 def plot_scaling(args):
     rows = cells.read(args.out / "results/linear_value_mpc_times.csv")
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")
-    labels = [label for label in CONTROLLERS if "actor" not in label]
+    labels = [label for label in CONTROLLERS if "actor" not in label and any(row["controller"] == label for row in rows)]
     for ax, axis in zip(axes, ("n", "horizon")):
         values = sorted({int(row[axis]) for row in rows if row["axis"] == axis})
         print(f"{axis}: median ms per step and (mean ms of the first five steps) at {values}")

@@ -3,9 +3,9 @@
     python experiments/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
 
 controllers: closed loops over random starts, goals and plants, and the same with a fault at every fourth step: numbers that are not
-finite in the measurement, in the previous plan and in its multipliers, states far outside the box, a solver stopped after three
-iterations, goals that cannot be reached. An action must be finite and within its limits, a measurement that is none must be refused,
-and the next step without a fault must be solved again.
+finite in the measurement or in the previous plan, states far outside the box, a solver stopped after one iteration (goal_mpc.py: three) or
+by a deadline, goals that cannot be held. An action must be finite and within its limits, a measurement that is none must be refused, a plan
+must cost no more than its first guess, and the next step without a fault must be planned again.
 training: SIGKILL at random moments, then --resume; the end must equal an uninterrupted run, bit for bit.
 checkpoints: damaged and malicious files; each must be refused in one sentence or, where the damage is not to be seen, load as finite
 numbers.
@@ -41,9 +41,12 @@ sys.path.insert(0, str(ROOT))
 import cells
 import reproduce
 
+import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
+from envs.tools.checkpoint import MAX_CHECKPOINT_BYTES
+from envs.tools.expansion import torch_value
 
 EPISODE = 25  # steps
 CONTROLLERS = {
@@ -58,19 +61,23 @@ CONTROLLERS = {
     "goal_mpc.py, pendulum": lambda: gm.build_controller(gm.Args(horizon=20)),
 }
 PLANS = [name for name in CONTROLLERS if name not in ("actor", "RL+MPC, N = 0")]  # have a solver and a plan
+IPOPT = [name for name in PLANS if name.startswith("goal_mpc.py")]
+ANYTIME = [name for name in PLANS if name not in IPOPT]
 FAULTS = {  # case: controllers that it can befall
     "random": list(CONTROLLERS),
     "plan not finite": PLANS,
-    "multipliers not finite": PLANS,
     "measurement not finite": list(CONTROLLERS),
     "state far outside": list(CONTROLLERS),
-    "3 iterations": PLANS,
-    "3 iterations, always": PLANS,
+    "deadline": ANYTIME,
+    "stopped early": PLANS,
+    "stopped early, always": PLANS,
     "goal out of reach": list(CONTROLLERS),
 }
+LASTING = ("goal out of reach", "stopped early, always")  # not at single steps
+ANSWERS = {"solved": "planned", "retry": "planned", "plan": "fell_back", "hold": "held"}  # rungs of goal_mpc.py
 STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 1,000
 CELL = 500  # steps
-RUNGS = ("solved", "retry", "plan", "actor", "hold")  # of the failure ladder
+COUNTS = ("faults", "refused", "wrong", "cost_rose", "chances", "recovered", "planned", "fell_back", "held", "qp_unsolved")
 TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")  # columns that may differ from run to run
 
 
@@ -94,7 +101,7 @@ class Args:
 
 
 def stopped_early(controller):
-    """The controller's solvers, stopped after three iterations."""
+    """goal_mpc.py's solvers, stopped after three iterations."""
     usual = controller.solvers
     controller._build_solvers(controller.compiled, tol=1e-6, max_iter=3)
     early, controller.solvers = controller.solvers, usual
@@ -105,15 +112,15 @@ def stopped_early(controller):
 def built(name):
     torch.set_num_threads(1)
     controller = CONTROLLERS[name]()
-    return controller, stopped_early(controller) if name in PLANS else None
+    return controller, stopped_early(controller) if name in IPOPT else None
 
 
 def draw(plant, rng, far=False):
-    """Start state, goal (if far: out of reach) and plant parameters."""
+    """Start state, goal (if far: one that not every scenario can hold) and plant parameters."""
     psi = rng.uniform(plant.EVAL_PSI.min(axis=0), plant.EVAL_PSI.max(axis=0))
     goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH)
-    if far:
-        goal = goal + (plant.GOAL_HIGH - plant.GOAL_LOW) * rng.uniform(2, 10, size=goal.shape) * rng.choice([-1, 1], size=goal.shape)
+    while far and envs.can_hold(plant, goal):
+        goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH)
     return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH), goal, psi
 
 
@@ -126,19 +133,32 @@ def spoil(controller, case, x, rng):
     if case == "state far outside":
         reach = 10.0 ** rng.uniform(1, 12)
         return x + reach * rng.uniform(-1, 1, size=x.shape) * (controller.plant.INIT_HIGH - controller.plant.INIT_LOW)
-    if case in ("plan not finite", "multipliers not finite"):
-        for name in ("plan", "last"):  # each (w, multipliers of bounds, multipliers of constraints)
-            if getattr(controller, name, None) is not None:
-                parts = [part.copy() for part in getattr(controller, name)]
-                for part in parts[:1] if case.startswith("plan") else parts[1:]:
-                    part[rng.uniform(size=part.shape) < 0.1] = np.nan
-                setattr(controller, name, tuple(parts))
+    if case == "plan not finite" and controller.plan is not None:
+        if isinstance(controller.plan, tuple):  # goal_mpc.py: with multipliers of bounds and of constraints
+            plan = controller.plan[0].copy()
+            controller.plan = plan, *controller.plan[1:]
+        else:
+            plan = controller.plan = controller.plan.copy()
+        plan[rng.uniform(size=plan.shape) < 0.1] = np.nan
+        plan.flat[0] = np.nan
     return x
 
 
-def solved(controller):
-    """Whether the last step found an optimum, if need be from a second guess or with relaxed bounds, as the benchmarks do."""
-    return int(controller.stats["rung"] in ("solved", "retry"))
+def stop(controller, case, early, usual):
+    """Bring a fault of the solver about, or with case None take it back."""
+    if early is not None:
+        controller.solvers = early if case and case.startswith("stopped early") else usual
+    elif hasattr(controller, "iterations"):
+        controller.iterations = 1 if case and case.startswith("stopped early") else deploy.Args.iterations
+        controller.deadline_ms = 1e-3 if case == "deadline" else None
+
+
+def answered(controller):
+    """What the last action came from: planned, fell_back or held. Of a controller that does not plan its usual action counts as planned."""
+    stats = controller.stats
+    if isinstance(controller, gm.ScenarioMPC):
+        return ANSWERS[stats["rung"]]
+    return "held" if stats["rung"] == "hold" else "fell_back" if stats["fell_back"] else "planned"
 
 
 def closed_loop(cell):
@@ -146,20 +166,20 @@ def closed_loop(cell):
     case, name, steps, seed = cell
     controller, early = built(name)
     plant, rng = controller.plant, np.random.default_rng([seed, *case.encode(), *name.encode()])
-    counts = collections.Counter({key: 0 for key in ("faults", "refused", "wrong", "chances", "recovered", *RUNGS)})
-    usual = getattr(controller, "solvers", None)
+    counts = collections.Counter({key: 0 for key in COUNTS})
+    usual, lasting = getattr(controller, "solvers", None), case in LASTING
     for _ in range(max(steps // EPISODE, 1)):
         x, goal, psi = draw(plant, rng, far=case == "goal out of reach")
+        stop(controller, case if lasting else None, early, usual)
         controller.reset()
         controller.set_goal(goal)
-        controller.set_initial_guess(x)
         faulty_before = False
         for t in range(min(EPISODE, steps)):
-            faulty = case != "random" and t % 4 == 2 and case not in ("goal out of reach", "3 iterations, always")
+            faulty = case != "random" and t % 4 == 2 and not lasting
             measured = spoil(controller, case, x, rng) if faulty else x
-            if early is not None:
-                controller.solvers = early if case == "3 iterations, always" or faulty and case == "3 iterations" else usual
-            counts["faults"] += faulty or case in ("goal out of reach", "3 iterations, always")
+            if not lasting:
+                stop(controller, case if faulty else None, early, usual)
+            counts["faults"] += faulty or lasting
             try:
                 u = controller.make_step(measured)
             except ValueError as error:
@@ -167,21 +187,25 @@ def closed_loop(cell):
                     raise
                 counts["refused"] += 1
                 u = controller.make_step(x)  # the true state, as the next message may bring it
-                counts.update(chances=1, recovered=solved(controller))
+                counts.update(chances=1, recovered=int(answered(controller) == "planned"))
             else:
                 counts["wrong"] += not np.isfinite(measured).all()
                 if faulty_before:
-                    counts.update(chances=1, recovered=solved(controller))
+                    counts.update(chances=1, recovered=int(answered(controller) == "planned"))
                 faulty_before = faulty
-            counts[controller.stats["rung"]] += 1
+            stats = controller.stats
+            counts[answered(controller)] += 1
+            counts["cost_rose"] += stats.get("cost", 0.0) > stats.get("guess_cost", np.inf)
+            counts["qp_unsolved"] += stats.get("stop") == "unsolved"
             counts["wrong"] += not (np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all())
             x = plant.step(x, u, psi)
-        if case in ("goal out of reach", "3 iterations, always"):  # a last step without it
-            controller.solvers = usual
+        if lasting:  # a last step without it
+            stop(controller, None, early, usual)
             controller.set_goal(plant.EVAL_GOAL)
             controller.make_step(x)
-            counts.update(chances=1, recovered=solved(controller))
-    return [{"case": case, "controller": name, "steps": sum(counts[rung] for rung in RUNGS)} | dict(counts)]
+            counts.update(chances=1, recovered=int(answered(controller) == "planned"))
+    stop(controller, None, early, usual)
+    return [{"case": case, "controller": name, "steps": counts["planned"] + counts["fell_back"] + counts["held"]} | dict(counts)]
 
 
 def controllers(args):
@@ -343,7 +367,7 @@ def read(load, path):
     if isinstance(agent, sac.Policy):
         value = agent.value(agent.plant.START, agent.plant.EVAL_GOAL)
     else:
-        value = agent.value(*(torch.from_numpy(v)[None] for v in agent.example())).detach().numpy()
+        value = torch_value(agent, *(torch.from_numpy(v)[None] for v in (agent.plant.START, agent.plant.EVAL_GOAL))).numpy()
     return collections.Counter(["loaded" if np.isfinite(value).all() else "wrong"])
 
 
@@ -358,7 +382,7 @@ def checkpoints(args):
             for load in LOADERS:
                 counts[case] += read(load, path)
         with open(path, "wb") as file:  # takes no space on the disk
-            file.truncate(2 * deploy.MAX_CHECKPOINT_BYTES)
+            file.truncate(2 * MAX_CHECKPOINT_BYTES)
         for load in LOADERS:
             counts["larger than a gigabyte"] += read(load, path)
     return [result("checkpoints", case, sum(found.values()), found["refused"] + found["loaded"], f"{found['loaded']} of them loaded")

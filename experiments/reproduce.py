@@ -75,14 +75,16 @@ STEPS = [
     experiment("cstr_offline", "ablation", 40),
     experiment("cstr_offset_free", "training", 40, ["cstr_offline"]),
     experiment("cstr_offset_free", "loops", 60, CRITICS),
-    experiment("cstr_tune", minutes=40, needs=CRITICS),
+    experiment("cstr_tune", minutes=110, needs=CRITICS),
     experiment("cstr_profile", minutes=1, needs=CRITICS),
-    experiment("cstr_deploy", minutes=95, needs=CRITICS),
-    experiment("cstr_deploy", "critics", 15, CRITICS),
-    experiment("cstr_deploy", "literal", 20, CRITICS),
-    experiment("cstr_deploy", "expansion", 10, CRITICS),
-    experiment("cstr_oracle", minutes=40, needs=["cstr_deploy"]),
-    experiment("cstr_frontier", minutes=30, needs=["cstr_oracle"]),
+    experiment("cstr_deploy", minutes=60, needs=CRITICS),
+    experiment("cstr_deploy", "critics", 10, CRITICS),
+    experiment("cstr_deploy", "ipopt", 40, CRITICS),
+    experiment("cstr_deploy", "literal", 30, CRITICS),
+    experiment("cstr_deploy", "branching", 5, CRITICS),
+    experiment("cstr_oracle", minutes=90, needs=["cstr_deploy"]),
+    experiment("cstr_frontier", minutes=10, needs=["cstr_oracle"]),
+    experiment("cstr_stuck", minutes=40, needs=CRITICS),
     experiment("cstr_ablation", minutes=100, needs=["cstr_deploy_critics"]),
     experiment("cstr_shift", "plants", 50, CRITICS),
     experiment("cstr_shift", "critic", 4, CRITICS),
@@ -132,8 +134,8 @@ def version(quick):
     code = sorted(
         path
         for folder in (".", "envs", "envs/tools", "experiments")
-        for path in (ROOT / folder).glob("*.py")
-        if path.name != Path(__file__).name
+        for path in (ROOT / folder).iterdir()
+        if path.suffix in (".py", ".c") and path.name != Path(__file__).name
     )
     return hashlib.sha256(b"".join(path.read_bytes() for path in code) + bytes([quick])).hexdigest()[:12]
 

@@ -1,25 +1,20 @@
-"""Where the time of a step of the controllers goes, and how it grows with the horizon and the number of scenarios.
+"""Where the time of a step of the planners goes, and how it grows with the horizon and the number of scenarios.
 
     python experiments/solve_time.py                    # two minutes in one process, and compilation: nothing else should run
     python experiments/solve_time.py --plot-only        # redraw from the committed CSV
 
-`where`: closed loops over the paired draws of rl_mpc_deploy.py; CasADi's clocks give the function evaluations, IPOPT's own the linear
-algebra (in whole milliseconds per solve, too coarse for N = 1), the rest of the solver call and of make_step is what remains. The floor
-is the bare evaluation of objective, constraints and derivatives, once per iteration. `scaling`: cold solves of RL+MPC from the same start
-states, by horizon (9 scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters.
+`where`: closed loops over the paired draws of rl_mpc_deploy.py, with a clock around every call of a compiled function and of the solver of
+quadratic programs; what remains of make_step is Python. `scaling`: cold solves of RL+MPC from the same start states, by horizon (9
+scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters.
 
 Writes results/solve_time_where.csv, results/solve_time_scaling.csv and figures/solve_time.png.
 """
 
-import re
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
-import casadi as ca
 import matplotlib
 import numpy as np
 import tyro
@@ -36,23 +31,29 @@ import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
 
-CRITIC = HERE / "pretrained/cstr_robust.pt"
-CONTROLLERS = {"RL+MPC, N = 1": ("rl_mpc", 1), "RL+MPC, N = 5": ("rl_mpc", 5), "robust MPC, N = 20": ("robust_mpc", 20)}
+CONTROLLERS = {  # label: (name, keywords of rl_mpc_deploy.Args)
+    "RL+MPC, N = 1": ("rl_mpc", dict(horizon=1)),
+    "RL+MPC, N = 5": ("rl_mpc", dict(horizon=5)),
+    "RL+MPC, N = 5, one iteration": ("rl_mpc", dict(horizon=5, iterations=1)),
+    "RL+MPC, N = 5, robust horizon 2": ("rl_mpc", dict(horizon=5, robust_horizon=2)),
+    "RL+MPC, N = 10": ("rl_mpc", dict(horizon=10)),
+    "robust MPC, N = 20": ("robust_mpc", {}),
+    "robust MPC, N = 20, one iteration": ("robust_mpc", dict(iterations=1)),
+}
 HORIZONS, GRIDS = (1, 2, 5, 10, 20), (1, 2, 3, 5, 7)  # grids of k x k parameters
-FUNCTIONS = {"f": "objective", "g": "constraints", "grad_f": "gradient", "jac_g": "Jacobian", "hess_l": "Hessian"}
 PARTS = {  # column: (label, colour)
-    "functions_ms": ("function evaluations", "#0072B2"),
-    "linear_ms": ("linear algebra (MUMPS)", "#E69F00"),
-    "solver_ms": ("rest of IPOPT and CasADi", "#999999"),
-    "python_ms": ("Python: guesses, bounds", "#D55E00"),
+    "rollouts_ms": ("rollouts: guesses and line search", "#56B4E9"),
+    "linearise_ms": ("linearisation", "#0072B2"),
+    "qp_ms": ("quadratic programs (HPIPM)", "#E69F00"),
+    "python_ms": ("Python", "#999999"),
 }
 
 
 @dataclass(frozen=True)
 class Args:
-    episodes: int = 6
+    episodes: int = 10
     """draws of start and plant (scaling: start states)"""
-    steps: int = 60
+    steps: int = 100
     """sampling times per draw"""
     seed: int = 0
     """of the draws"""
@@ -64,96 +65,44 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-class Clocked:
-    """A solver of ScenarioMPC with IPOPT's timing statistics: calls go through, and what its clocks say is kept."""
+class Clock:
+    """A callable that adds up the seconds of its calls."""
 
-    def __init__(self, solver, report):
-        self.solver, self.report, self.log, self.reading_ms = solver, report, [], 0.0
+    def __init__(self, function):
+        self.function, self.seconds, self.calls = function, 0.0, 0
 
-    def __call__(self, **arguments):
+    def __call__(self, *arguments):
         tick = time.perf_counter()
-        result = self.solver(**arguments)
-        total, stats = 1e3 * (time.perf_counter() - tick), self.solver.stats()
-        linear = 1e3 * float(re.findall(r"StdAugSystemSolverMultiSolve.*wall: +([\d.]+)", self.report.read_text())[-1])  # of this call
-        each = {name: 1e3 * stats[f"t_wall_nlp_{name}"] for name in FUNCTIONS}
-        self.log.append(
-            each | {"call_ms": total, "functions_ms": sum(each.values()), "linear_ms": linear, "iterations": stats["iter_count"]}
-        )
+        result = self.function(*arguments)
+        self.seconds += time.perf_counter() - tick
+        self.calls += 1
         return result
-
-    def stats(self):
-        return self.solver.stats()
-
-
-def clocked(build, folder):
-    """`build()` with both of its solvers clocked: IPOPT writes its timing statistics into a file per solver."""
-    plain = ca.nlpsol
-
-    def nlpsol(name, plugin, nlp, *options):
-        if options:  # the solver itself; the first call, without options, only generates code
-            more = {"output_file": str(folder / f"{name}.txt"), "file_print_level": 3, "print_timing_statistics": "yes"}
-            options = ({**options[0], "ipopt": {**options[0]["ipopt"], **more}},)
-        return plain(name, plugin, nlp, *options)
-
-    ca.nlpsol = nlpsol
-    try:
-        controller = build()
-    finally:
-        ca.nlpsol = plain
-    controller.solvers = {name: Clocked(solver, folder / f"{name}.txt") for name, solver in controller.solvers.items()}
-    return controller
-
-
-def floor(controller, repeats):
-    """Milliseconds of one bare evaluation of every function that an iteration needs, at the last plan."""
-    solver, w = controller.solvers["warm"].solver, controller.last_w
-    p = controller._parameters(cstr.START, np.minimum(controller.slack_price, 1e3))
-    lam, total = np.zeros(controller.nlp["g"].numel()), 0.0
-    for name in FUNCTIONS:
-        function = solver.get_function(f"nlp_{name}")
-        buffer, evaluate = function.buffer()  # calls without a copy of arguments and results
-        arguments = [np.array(a, dtype=float) for a in (w, p, 1.0, lam)[: function.n_in()]]
-        results = [np.zeros(function.nnz_out(i)) for i in range(function.n_out())]
-        for i, value in enumerate(arguments):
-            buffer.set_arg(i, memoryview(value.reshape(-1)))
-        for i, value in enumerate(results):
-            buffer.set_res(i, memoryview(value))
-        times = []
-        for _ in range(repeats):
-            tick = time.perf_counter()
-            evaluate()
-            times.append(time.perf_counter() - tick)
-        total += 1e3 * np.median(times)
-    return total
 
 
 def where(args):
-    """Rows: averages per step, over all steps, of every controller."""
+    """Rows: averages per step, over all steps, of every controller, and quantiles of a whole step."""
     rows = []
-    for label, (name, horizon) in CONTROLLERS.items():
-        with tempfile.TemporaryDirectory() as folder:
-            settings = deploy.Args(horizon=horizon, critic=CRITIC, compile=not args.quick)
-            mpc, steps = clocked(partial(deploy.build_controller, name, settings), Path(folder)), []
-            starts, psi = deploy.draws(cstr, args.episodes, args.seed)
-            for i in tqdm(range(args.episodes), desc=label, disable=None):
-                mpc.reset()
-                mpc.set_initial_guess(starts[i])
-                x = starts[i]
-                for _ in range(args.steps):
-                    reading = sum(solver.reading_ms for solver in mpc.solvers.values())
-                    u = mpc.make_step(x)
-                    steps.append(mpc.stats["wall_ms"] - sum(solver.reading_ms for solver in mpc.solvers.values()) + reading)
-                    x = cstr.step(x, u, psi[i])
-            log = [entry for solver in mpc.solvers.values() for entry in solver.log]
-            sums = {key: sum(entry[key] for entry in log) for key in log[0]}
-            iterations, n = sums["iterations"], len(steps)
-            row = {"controller": label, "steps": n, "step_ms_mean": np.mean(steps), "step_ms_median": np.median(steps),
-                   "step_ms_p95": np.quantile(steps, 0.95), "iterations_mean": iterations / n}  # fmt: skip
-            row |= {key: sums[key] / n for key in ("functions_ms", "linear_ms")}
-            row["solver_ms"] = (sums["call_ms"] - sums["functions_ms"] - sums["linear_ms"]) / n
-            row["python_ms"] = np.mean(steps) - sums["call_ms"] / n
-            row |= {f"{name}_ms_per_iteration": sums[name] / iterations for name in FUNCTIONS}
-            row["floor_ms"] = floor(mpc, 5 if args.quick else 200) * iterations / n
+    for label, (name, options) in CONTROLLERS.items():
+        mpc = deploy.build_controller(name, deploy.Args(**options, compile=not args.quick))
+        mpc.rollout, mpc.linearise, mpc.qp.solve = Clock(mpc.rollout), Clock(mpc.linearise), Clock(mpc.qp.solve)
+        mpc.follow = [Clock(follow) for follow in mpc.follow]
+        starts, psi = deploy.draws(cstr, args.episodes, args.seed)
+        log, inner = [], 0
+        for i in tqdm(range(args.episodes), desc=label, disable=None):
+            mpc.reset()
+            x = starts[i]
+            for _ in range(args.steps):
+                x = cstr.step(x, mpc.make_step(x), psi[i])
+                log.append(mpc.stats)
+                inner += mpc.qp.iterations
+        milliseconds = np.array([stats["wall_ms"] for stats in log])
+        n = len(log)
+        row = {"controller": label, "nodes": len(mpc.tree.stage), "steps": n, "step_ms_mean": milliseconds.mean()}
+        row |= {f"step_ms_{key}": np.quantile(milliseconds, q) for key, q in (("median", 0.5), ("p95", 0.95), ("p999", 0.999), ("max", 1))}
+        row |= {"iterations_mean": mpc.qp.solve.calls / n, "qp_iterations_mean": inner / n}  # of the last program of each step
+        row["rollouts_ms"] = 1e3 * sum(clock.seconds for clock in (mpc.rollout, *mpc.follow)) / n
+        row |= {"linearise_ms": 1e3 * mpc.linearise.seconds / n, "qp_ms": 1e3 * mpc.qp.solve.seconds / n}
+        row["python_ms"] = row["step_ms_mean"] - sum(row[key] for key in list(PARTS)[:3])
         rows.append({k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()} | {"machine": cells.machine()})
     return rows
 
@@ -176,7 +125,7 @@ def scaling(args):
     for axis, n, k in tqdm(todo, desc="scaling", disable=None):
         cstr.SCENARIOS["mpc"] = grid(k)
         try:
-            mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, critic=CRITIC, compile=not args.quick))
+            mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, compile=not args.quick))
         finally:
             cstr.SCENARIOS["mpc"] = shipped
         log = []
@@ -185,9 +134,9 @@ def scaling(args):
             mpc.make_step(x)
             log.append((mpc.stats["wall_ms"], mpc.stats["iterations"]))
         ms, iterations = np.transpose(log)
-        rows.append({"axis": axis, "horizon": n, "scenarios": k * k, "nodes": sum(mpc.nodes[1:]), "variables": mpc.nlp["x"].numel(),
-                     "ms_median": round(np.median(ms), 3), "iterations_median": np.median(iterations),
-                     "ms_per_iteration": round(np.median(ms / iterations), 4), "machine": cells.machine()})  # fmt: skip
+        rows.append({"axis": axis, "horizon": n, "scenarios": k * k, "nodes": len(mpc.tree.stage) - 1, "ms_median": round(np.median(ms), 3),
+                     "iterations_median": np.median(iterations), "ms_per_iteration": round(np.median(ms / iterations), 4),
+                     "machine": cells.machine()})  # fmt: skip
     return rows
 
 
@@ -198,26 +147,24 @@ def exponent(rows, size):
 
 
 def plot(where_rows, scaling_rows, path):
-    fig, axes = plt.subplots(1, 3, figsize=(11, 3.4), layout="constrained", width_ratios=(1.5, 1, 1))
+    fig, axes = plt.subplots(1, 3, figsize=(12, 3.9), layout="constrained", width_ratios=(1.7, 1, 1))
     for y, row in enumerate(where_rows):
         left = 0.0
         for key, (label, colour) in PARTS.items():
-            share = 100 * float(row[key]) / float(row["step_ms_mean"])
-            axes[0].barh(y, share, left=left, color=colour, label=label if y == 0 else None)
-            left += share
-        axes[0].plot(2 * [100 * float(row["floor_ms"]) / float(row["step_ms_mean"])], [y - 0.4, y + 0.4], color="black", lw=2,
-                     label="floor: bare evaluations" if y == 0 else None)  # fmt: skip
-    axes[0].set_yticks(range(len(where_rows)), [f"{row['controller']}\nmean {float(row['step_ms_mean']):.1f} ms" for row in where_rows])
+            axes[0].barh(y, float(row[key]), left=left, color=colour, label=label if y == 0 else None)
+            left += float(row[key])
+        axes[0].annotate(f"{left:.1f}", (left, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9)
+    axes[0].set_yticks(range(len(where_rows)), [row["controller"] for row in where_rows], fontsize=9)
     axes[0].invert_yaxis()
-    axes[0].set(xlabel="share of a step [%]", xlim=(0, 100))
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=8)
-    for ax, axis, size in ((axes[1], "horizon", "horizon"), (axes[2], "scenarios", "scenarios")):
+    axes[0].set(xlabel="mean time of a step [ms]", xlim=(0, 1.12 * max(float(row["step_ms_mean"]) for row in where_rows)))
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    for ax, axis in zip(axes[1:], ("horizon", "scenarios")):
         mine = [row for row in scaling_rows if row["axis"] == axis]
-        x, y = (np.array([float(row[key]) for row in mine]) for key in (size, "ms_per_iteration"))
+        x, y = (np.array([float(row[key]) for row in mine]) for key in (axis, "ms_per_iteration"))
         ax.plot(x, y, "o-", color="#0072B2", label="measured")
         ax.plot(x, y[-1] * x / x[-1], ls=":", color="black", label="proportional")
-        ax.set(xscale="log", yscale="log", xlabel={"horizon": "horizon N (9 scenarios)", "scenarios": "scenarios (N = 5)"}[axis],
-               ylabel="time per iteration [ms]")  # fmt: skip
+        ax.set(xscale="log", yscale="log", ylabel="time per iteration [ms]")
+        ax.set_xlabel({"horizon": "horizon N (9 scenarios)", "scenarios": "scenarios (N = 5)"}[axis])
         ax.set_xticks(x, [f"{v:.0f}" for v in x])
         ax.set_xticks([], minor=True)
         ax.yaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
@@ -238,17 +185,18 @@ def main(args):
         cells.write(where(args), args.out / "results/solve_time_where.csv")
         cells.write(scaling(args), args.out / "results/solve_time_scaling.csv")
     where_rows, scaling_rows = (cells.read(args.out / f"results/solve_time_{name}.csv") for name in ("where", "scaling"))
+    print(
+        f"{'':36s}{'step, ms: mean  median     p95   99.9 %     max':48s}  SQP, QP iterations  "
+        + "  ".join(label for label, _ in PARTS.values())
+    )
     for row in where_rows:
-        print(
-            f"{row['controller']}: {float(row['step_ms_mean']):.2f} ms per step in the mean, {float(row['iterations_mean']):.1f} iterations"
-        )
-        for key, (label, _) in PARTS.items():
-            print(f"    {label:28s}{float(row[key]):8.2f} ms{100 * float(row[key]) / float(row['step_ms_mean']):6.0f} %")
-        print(f"    {'floor: bare evaluations':28s}{float(row['floor_ms']):8.2f} ms")
-    for axis, size in (("horizon", "horizon"), ("scenarios", "scenarios")):
+        step = "".join(f"{float(row[f'step_ms_{key}']):9.2f}" for key in ("mean", "median", "p95", "p999", "max"))
+        parts = "".join(f"{float(row[key]):9.2f}" for key in PARTS)
+        print(f"{row['controller']:36s}{step}{float(row['iterations_mean']):9.1f}{float(row['qp_iterations_mean']):6.1f}   {parts}")
+    for axis in ("horizon", "scenarios"):
         mine = [row for row in scaling_rows if row["axis"] == axis]
-        print(f"{axis}: " + ", ".join(f"{row[size]}: {float(row['ms_per_iteration']):.2f}" for row in mine)
-              + f" ms per iteration; exponent {exponent(mine, size):.2f}")  # fmt: skip
+        print(f"{axis}: " + ", ".join(f"{row[axis]}: {float(row['ms_per_iteration']):.2f}" for row in mine)
+              + f" ms per iteration; exponent {exponent(mine, axis):.2f}")  # fmt: skip
     plot(where_rows, scaling_rows, args.out / "figures/solve_time.png")
 
 

@@ -149,6 +149,47 @@ def test_vector_env_state_continues_exactly():
     np.testing.assert_array_equal([vec.step(action)[0]["observation"] for _ in range(60)], expected)
 
 
+def test_a_goal_is_checked_and_copied():
+    linear, pendulum = envs.load("linear", dim=3), envs.load("double_pendulum")
+    for goal in (0.65, [0.65], np.float32(0.65), np.array(0.65)):
+        assert envs.checked_goal(cstr, goal).shape == (1,)
+    given = np.array([[0.5, 0.6, 0.7, 2.0]])
+    goal = envs.checked_goal(cstr, given, 4)
+    given[:] = 0
+    np.testing.assert_array_equal(goal, [[0.5, 0.6, 0.7, 2.0]])
+    np.testing.assert_array_equal(envs.checked_goal(pendulum, [np.pi, -np.pi]), [np.pi, -np.pi])
+    assert envs.checked_goal(linear, np.zeros((3, 5)), 5).shape == (3, 5)
+    assert envs.checked_goal(linear, np.zeros((3, 3)), 3).shape == (3, 3)
+    step = np.array([[-1.0, 1.0, 0.5]] * 5).T  # a row per component, each within its own limits
+    np.testing.assert_array_equal(envs.checked_goal(linear, step, 5), step)
+
+
+@pytest.mark.parametrize(
+    "plant, goal, horizon",
+    [
+        ("cstr", [0.6, 0.6], None),
+        ("cstr", [[0.6, 0.6]], None),
+        ("cstr", [[0.6, 0.6]], 3),
+        ("cstr", [[0.6], [0.6]], 2),
+        ("cstr", [], None),
+        ("cstr", 0.0999, None),
+        ("cstr", 2.0001, None),
+        ("cstr", np.nan, None),
+        ("cstr", np.inf, 4),
+        ("cstr", [[0.6, 0.6, -np.inf]], 3),
+        ("cstr", [[0.6, 2.1, 0.6]], 3),
+        ("double_pendulum", 0.0, None),
+        ("double_pendulum", [0.0, 3.2], None),
+        ("double_pendulum", [[0.0, 0.0], [0.0, 3.2]], 2),
+        ("linear", [0.0, 1.1], None),
+    ],
+)
+def test_a_goal_of_another_shape_or_outside_the_range_is_refused(plant, goal, horizon):
+    with pytest.raises(ValueError, match="goal is") as error:
+        envs.checked_goal(envs.load(plant), goal, horizon)
+    assert "\n" not in str(error.value)
+
+
 def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path):
     made = [envs.new_folder(tmp_path / "runs/cstr__0__1") for _ in range(3)]
     assert [path.name for path in made] == ["cstr__0__1", "cstr__0__1-2", "cstr__0__1-3"] and all(path.is_dir() for path in made)

@@ -67,7 +67,7 @@ def tree_qp(tree, n_x, n_u, active, changes, compile=True):
 
 
 def pointer(array):
-    return array.ctypes.data_as(ctypes.c_void_p)
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 class TreeQP:
