@@ -141,10 +141,9 @@ class Critic:
         # what torch would refuse, and what is no use
         shapes = [(w.shape, b.shape) for layers in (actor, *self.twins) for w, b in layers]
         wanted = [[*sizes, 2 * n_u], *[[sizes[0] + n_u, *sizes[1:], 1]] * 2]
-        if shapes != [((m, n), (m, 1)) for widths in wanted for n, m in zip(widths, widths[1:])]:
-            raise ValueError("weights that do not fit")
-        if self.goal_input not in ("error", "goal"):
-            raise ValueError(f"unknown goal_input {self.goal_input!r}")
+        fit = shapes == [((m, n), (m, 1)) for widths in wanted for n, m in zip(widths, widths[1:])]
+        if not (fit and self.goal_input in ("error", "goal")):
+            raise ValueError("networks that do not fit")
         if not all((v > 0).all() for name, v in self.scaling.items() if name.endswith("scale")):
             raise ValueError("scales that are not positive")
         weights = [part for layers in (self.actor, *self.twins) for layer in layers for part in layer]
@@ -239,7 +238,8 @@ class ScenarioMPC(Controller):
         # prices per scaled unit; states without a bound or a price are left out
         price, change_weight = np.array(slack_price, dtype=float), np.array(change_weight, dtype=float)
         if not ((price >= 0).all() and (change_weight >= 0).all()):  # nor nan
-            raise ValueError(f"slack_price is {price}, change_weight {change_weight}; they must be >= 0")
+            weights = f"slack_price is {price.tolist()}, change_weight {change_weight.tolist()}"
+            raise ValueError(f"{weights}; they must not be negative")
         bounds = (np.array([plant.X_LOW, plant.X_HIGH]) - self.x_center) / self.x_scale
         active = np.isfinite(bounds) & (price > 0)
         self.rows = np.flatnonzero(active.any(axis=0))
@@ -259,7 +259,8 @@ class ScenarioMPC(Controller):
         follow (...) -> the policy's actions.
         """
         tree, N, S, rows = self.tree, self.horizon, len(self.scenarios), self.rows.tolist()
-        n_x, n_u, n_goal, n = len(self.x_scale), len(self.u_scale), len(self.plant.GOAL_INDEX), len(tree.stage) - 1
+        n_x, n_u, n_goal = len(self.x_scale), len(self.u_scale), len(self.plant.GOAL_INDEX)
+        n = len(tree.stage) - 1
         # parameters and variables
         start, psi = ca.MX.sym("start", n_x, S), ca.MX.sym("psi", self.scenarios.shape[1], S)
         weight, goal = ca.MX.sym("weight", 1, n + 1), ca.MX.sym("goal", n_goal, N)
@@ -306,7 +307,8 @@ class ScenarioMPC(Controller):
         moved = u - ca.horzcat(u_before, u[:, tree.parent[1 : tree.inner].tolist()])
         (X,) = rolled_out(step, planned)
         J = weight[1:] @ (stage.map(n)(X, goals) + slack.map(n)(X, prices)).T
-        J += weight[: tree.inner] @ (change.T @ moved**2).T - weight[-leaves:] @ final.map(leaves)(X[:, -leaves:], *last).T
+        J += weight[: tree.inner] @ (change.T @ moved**2).T
+        J -= weight[-leaves:] @ final.map(leaves)(X[:, -leaves:], *last).T
         rollout = ca.Function("rollout", [*problem, u], [J, X])
         X, A, B = rolled_out(step_jacobian, planned)
         slopes, hessians = stage_model.map(n)(X, goals)
@@ -317,8 +319,8 @@ class ScenarioMPC(Controller):
         if self.policy is None:
             return [rollout, linearise]
 
-        found, actions = call(self.policy, x * self.x_scale + self.x_center, g, m), []
-        policy = ca.Function("policy", [x, g, m], [ca.fmax(ca.fmin((found - self.u_center) / self.u_scale, 1), -1)], named)
+        found, actions = (call(self.policy, state, g, m) - self.u_center) / self.u_scale, []
+        policy = ca.Function("policy", [x, g, m], [ca.fmax(ca.fmin(found, 1), -1)], named)
 
         def follow(t, x):
             x = x if t else x @ weight[1 : S + 1].T  # scenarios share the first action: that of their mean
@@ -406,7 +408,7 @@ class ScenarioMPC(Controller):
             u = call(self.policy, x, goal, self.estimator.mismatch) if self.policy is not None else np.nan
             return np.array(u).ravel()
         best = min(costs, key=costs.get)
-        self.stats |= {"rung": "plan", "guess": best, "guess_cost": costs[best], "stop": "limit", "predicted": 0.0}
+        self.stats |= dict(rung="plan", guess=best, guess_cost=costs[best], stop="limit", predicted=0.0)
         self.plan, self.stats["cost"] = self._improve(guesses[best], costs[best], tick)
         return self.plan[0] * self.u_scale + self.u_center
 
@@ -443,11 +445,11 @@ def build_controller(name, args):
     kind = args.estimate if args.offset_free else observed
     options = dict(goal=goal, estimator=estimator(kind), compile=args.compile)
     options |= dict(iterations=args.iterations, deadline_ms=args.deadline_ms)
-    if name in ("nominal_mpc", "robust_mpc"):  # of the plant's benchmark, which sums slack over scenarios
+    if name in ("nominal_mpc", "robust_mpc"):  # the plant's benchmark: its prices count once per scenario
         robust, benchmark = name == "robust_mpc", plant.BENCHMARK
-        price = benchmark["slack_price"] * (len(scenarios) if robust else 1)
-        options |= dict(robust_horizon=int(robust), slack_price=price)
-        options |= dict(change_weight=benchmark["change_weight"])
+        counted = len(scenarios) if robust else 1
+        options |= {key: counted * benchmark[key] for key in ("slack_price", "change_weight")}
+        options |= dict(robust_horizon=int(robust))
         stage = ca.Function("stage", [x, g], [squared_error])
         return ScenarioMPC(plant, benchmark["horizon"], scenarios, stage, **options)
     sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
@@ -549,8 +551,9 @@ def check(args):
         raise ValueError("--horizon is 0; --controllers goal_mpc plans, so that it must be at least 1")
     if not args.controllers:
         raise ValueError(f"--controllers is empty; choose from {', '.join(LABELS)}")
-    if len(args.change_weight or plant.U_LOW) != len(plant.U_LOW):
-        raise ValueError(f"--change-weight is {args.change_weight}; it needs {len(plant.U_LOW)} numbers")
+    changes = args.change_weight or [0.0] * len(plant.U_LOW)
+    if len(changes) != len(plant.U_LOW) or not all(0 <= price < np.inf for price in changes):
+        raise ValueError(f"--change-weight is {changes}; it needs {len(plant.U_LOW)} numbers of at least 0")
     uncertain = np.ptp(plant.SCENARIOS["mpc"], axis=0).any()
     if args.offset_free and args.estimate == "parameters" and not uncertain:
         raise ValueError(f"--estimate is parameters, but {args.env} has none that are uncertain")
@@ -584,8 +587,8 @@ def main(args):
     draw_episode(plant, lines, np.tile(goal, (args.steps, 1)), out / "episode.png")
     print(table(rows))
     seconds = time.perf_counter() - tick
-    print(f"{args.episodes} paired draws in {seconds:.0f} s; {out}/results.csv, trajectories.npz, and episode.png")
-    print("from the plant's start state on the nominal plant")
+    print(f"{args.episodes} paired draws in {seconds:.0f} s; {out}/results.csv, trajectories.npz and episode.png,")
+    print("which starts from the plant's own start state and has nominal parameters")
     return rows
 
 

@@ -245,12 +245,13 @@ def checked_goal(plant, goal, horizon=None):
     """
     n, goal = len(plant.GOAL_INDEX), np.array(goal, dtype=float)
     goal = goal.reshape(1) if goal.ndim == 0 and n == 1 else goal
-    if goal.shape not in ((n,), (n, horizon)):
-        raise ValueError(f"goal is {goal}; {plant.ENV_ID} needs {n} number(s){f', or {n} for each of {horizon} stages' if horizon else ''}")
     low, high = plant.GOAL_LOW, plant.GOAL_HIGH
+    shown, low_shown, high_shown = (np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high))
+    if goal.shape not in ((n,), (n, horizon)):
+        stages = f", or {n} for each of {horizon} stages" if horizon else ""
+        raise ValueError(f"goal is {shown}; {plant.ENV_ID} needs {n} number(s){stages}")
     if not ((low <= goal.T) & (goal.T <= high)).all():  # nor is nan
-        raise ValueError(f"goal is {goal}; {plant.ENV_ID} takes {np.array2string(low, threshold=4, edgeitems=1)} to "
-                         f"{np.array2string(high, threshold=4, edgeitems=1)}")  # fmt: skip
+        raise ValueError(f"goal is {shown}; {plant.ENV_ID} takes {low_shown} to {high_shown}")
     return goal
 
 

@@ -9,8 +9,9 @@
 The agents are those of `python sac_her_branching.py --env linear --dim 32 --system 0 --seed 0`, and of 1 to 9; the scaling study has one
 more for each smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a
 price of 1 (rl_mpc_deploy.py); they differ in what stands at x_N: nothing, -V, with as many iterations as needed or with one, or the
-paper's fast variant, -V expanded about the goal to second order (`taylor_value`). Beside them the goal-conditioned MPC of
-linear_scalability.py, whose costs contain the input and whose terminal cost is the regulator's.
+paper's fast variant, -V expanded about the goal to second order (`taylor_value`). Those with a value first guess the
+actor's actions, that without one the regulator's. Beside them the goal-conditioned MPC of linear_scalability.py, whose costs contain the
+input and whose terminal cost is the regulator's.
 
 Writes results/linear_value_mpc_NAME.csv for NAME in training, profile, distance, times, linear_value_mpc.csv (a row per closed loop of the
 profile study), and the figures linear_value_mpc.png, linear_value_mpc_distance.png and linear_value_mpc_times.png.
@@ -179,14 +180,17 @@ def build(label, dim, system, horizon, critic, compile=True):
     if settings is None:
         return gm.build_controller(gm.Args(env="linear", dim=dim, system=system, horizon=horizon, slack_weight=1.0, compile=False))
     settings = deploy.Args(env="linear", critic=critic, horizon=horizon, compile=compile, **settings)
-    if label != "RL+MPC, taylor":
+    if label not in ("goal-conditioned MPC, no value", "RL+MPC, taylor"):
         return deploy.build_controller(settings.controllers[0], settings)
     critic = deploy.load_critic(critic, "linear")
-    plant, mu = critic.plant, deploy.export(critic)[0]
+    plant = critic.plant
     x, goal = ca.MX.sym("x", dim), ca.MX.sym("goal", dim)
     stage = ca.Function("stage", [x, goal], [-ca.exp(-ca.sumsqr(x - goal) / (2 * plant.MPC_SIGMA2))])
-    return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], stage, taylor_value(critic), goal=plant.EVAL_GOAL, policy=mu,
-                              compile=compile)  # fmt: skip
+    if label == "RL+MPC, taylor":
+        value, policy = taylor_value(critic), deploy.export(critic)[0]
+    else:  # far from the goal the stage cost is flat: from middle actions no solver would find the way
+        value, policy = None, gm.feedback_law(plant)
+    return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], stage, value, goal=plant.EVAL_GOAL, policy=policy, compile=compile)
 
 
 def run_loop(controller, plant, x0, steps):

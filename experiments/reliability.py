@@ -195,7 +195,7 @@ def closed_loop(cell):
                 faulty_before = faulty
             stats = controller.stats
             counts[answered(controller)] += 1
-            counts["cost_rose"] += stats.get("cost", 0.0) > stats.get("guess_cost", np.inf)
+            counts["cost_rose"] += not stats.get("cost", 0.0) <= stats.get("guess_cost", np.inf)  # nor is nan
             counts["qp_unsolved"] += stats.get("stop") == "unsolved"
             counts["wrong"] += not (np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all())
             x = plant.step(x, u, psi)

@@ -5,11 +5,13 @@
 
 `where`: closed loops over the paired draws of rl_mpc_deploy.py, with a clock around every call of a compiled function and of the solver of
 quadratic programs; what remains of make_step is Python. `scaling`: cold solves of RL+MPC from the same start states, by horizon (9
-scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters.
+scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters; the time per iteration is that of
+linearisation, quadratic program and line search.
 
 Writes results/solve_time_where.csv, results/solve_time_scaling.csv and figures/solve_time.png.
 """
 
+import collections
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -42,9 +44,10 @@ CONTROLLERS = {  # label: (name, keywords of rl_mpc_deploy.Args)
 }
 HORIZONS, GRIDS = (1, 2, 5, 10, 20), (1, 2, 3, 5, 7)  # grids of k x k parameters
 PARTS = {  # column: (label, colour)
-    "rollouts_ms": ("rollouts: guesses and line search", "#56B4E9"),
+    "guesses_ms": ("first guesses", "#56B4E9"),
     "linearise_ms": ("linearisation", "#0072B2"),
     "qp_ms": ("quadratic programs (HPIPM)", "#E69F00"),
+    "search_ms": ("line search", "#009E73"),
     "python_ms": ("Python", "#999999"),
 }
 
@@ -65,18 +68,31 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-class Clock:
-    """A callable that adds up the seconds of its calls."""
+def clocked(mpc):
+    """Put a clock around what a planner calls. Returns a counter of the milliseconds of PARTS, of programs and of their iterations."""
+    spent = collections.Counter()
 
-    def __init__(self, function):
-        self.function, self.seconds, self.calls = function, 0.0, 0
+    def clock(function, part):
+        def call(*arguments):
+            tick = time.perf_counter()
+            result = function(*arguments)
+            spent[part()] += 1e3 * (time.perf_counter() - tick)
+            return result
 
-    def __call__(self, *arguments):
-        tick = time.perf_counter()
-        result = self.function(*arguments)
-        self.seconds += time.perf_counter() - tick
-        self.calls += 1
+        return call
+
+    def solve(*arguments):
+        result = program(*arguments)
+        spent.update(programs=1, qp_iterations=mpc.qp.iterations)
         return result
+
+    # a rollout before the first iteration of a step is that of a guess
+    mpc.rollout = clock(mpc.rollout, lambda: "search_ms" if mpc.stats["iterations"] else "guesses_ms")
+    mpc.follow = [clock(follow, lambda: "guesses_ms") for follow in mpc.follow]
+    mpc.linearise = clock(mpc.linearise, lambda: "linearise_ms")
+    program = clock(mpc.qp.solve, lambda: "qp_ms")
+    mpc.qp.solve = solve
+    return spent
 
 
 def where(args):
@@ -84,25 +100,23 @@ def where(args):
     rows = []
     for label, (name, options) in CONTROLLERS.items():
         mpc = deploy.build_controller(name, deploy.Args(**options, compile=not args.quick))
-        mpc.rollout, mpc.linearise, mpc.qp.solve = Clock(mpc.rollout), Clock(mpc.linearise), Clock(mpc.qp.solve)
-        mpc.follow = [Clock(follow) for follow in mpc.follow]
+        spent = clocked(mpc)
         starts, psi = deploy.draws(cstr, args.episodes, args.seed)
-        log, inner = [], 0
+        log = []
         for i in tqdm(range(args.episodes), desc=label, disable=None):
             mpc.reset()
             x = starts[i]
             for _ in range(args.steps):
                 x = cstr.step(x, mpc.make_step(x), psi[i])
                 log.append(mpc.stats)
-                inner += mpc.qp.iterations
         milliseconds = np.array([stats["wall_ms"] for stats in log])
         n = len(log)
         row = {"controller": label, "nodes": len(mpc.tree.stage), "steps": n, "step_ms_mean": milliseconds.mean()}
         row |= {f"step_ms_{key}": np.quantile(milliseconds, q) for key, q in (("median", 0.5), ("p95", 0.95), ("p999", 0.999), ("max", 1))}
-        row |= {"iterations_mean": mpc.qp.solve.calls / n, "qp_iterations_mean": inner / n}  # of the last program of each step
-        row["rollouts_ms"] = 1e3 * sum(clock.seconds for clock in (mpc.rollout, *mpc.follow)) / n
-        row |= {"linearise_ms": 1e3 * mpc.linearise.seconds / n, "qp_ms": 1e3 * mpc.qp.solve.seconds / n}
-        row["python_ms"] = row["step_ms_mean"] - sum(row[key] for key in list(PARTS)[:3])
+        # of the quadratic programs: in a step, and interior-point iterations of each
+        row |= {"iterations_mean": spent["programs"] / n, "qp_iterations_mean": spent["qp_iterations"] / spent["programs"]}
+        row |= {key: spent[key] / n for key in list(PARTS)[:-1]}
+        row["python_ms"] = row["step_ms_mean"] - sum(row[key] for key in list(PARTS)[:-1])
         rows.append({k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()} | {"machine": cells.machine()})
     return rows
 
@@ -128,14 +142,16 @@ def scaling(args):
             mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, compile=not args.quick))
         finally:
             cstr.SCENARIOS["mpc"] = shipped
-        log = []
+        spent, log = clocked(mpc), []
         for x in starts:
             mpc.reset()
+            spent.clear()
             mpc.make_step(x)
-            log.append((mpc.stats["wall_ms"], mpc.stats["iterations"]))
-        ms, iterations = np.transpose(log)
+            iterating = sum(spent[key] for key in ("linearise_ms", "qp_ms", "search_ms"))
+            log.append((mpc.stats["wall_ms"], iterating, mpc.stats["iterations"]))
+        ms, iterating, iterations = np.transpose(log)
         rows.append({"axis": axis, "horizon": n, "scenarios": k * k, "nodes": len(mpc.tree.stage) - 1, "ms_median": round(np.median(ms), 3),
-                     "iterations_median": np.median(iterations), "ms_per_iteration": round(np.median(ms / iterations), 4),
+                     "iterations_median": np.median(iterations), "ms_per_iteration": round(np.median(iterating / iterations), 4),
                      "machine": cells.machine()})  # fmt: skip
     return rows
 
@@ -156,8 +172,8 @@ def plot(where_rows, scaling_rows, path):
         axes[0].annotate(f"{left:.1f}", (left, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9)
     axes[0].set_yticks(range(len(where_rows)), [row["controller"] for row in where_rows], fontsize=9)
     axes[0].invert_yaxis()
-    axes[0].set(xlabel="mean time of a step [ms]", xlim=(0, 1.12 * max(float(row["step_ms_mean"]) for row in where_rows)))
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    axes[0].set(xlabel="mean time of a step [ms]", xlim=(0, 1.16 * max(float(row["step_ms_mean"]) for row in where_rows)))
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=9)
     for ax, axis in zip(axes[1:], ("horizon", "scenarios")):
         mine = [row for row in scaling_rows if row["axis"] == axis]
         x, y = (np.array([float(row[key]) for row in mine]) for key in (axis, "ms_per_iteration"))

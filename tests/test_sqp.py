@@ -152,7 +152,7 @@ def test_the_sqp_against_ipopt_from_the_rollout_of_the_policy():
     assert np.isfinite(costs[:, 2]).mean() > 0.95
     assert (costs[:, 0] <= costs[:, 1]).all()
     good, bad = shares(costs)
-    assert good >= 0.4 and bad <= 0.5
+    assert good >= 0.5 and bad <= 0.4
 
 
 def test_changes_of_the_actions_cost_the_same_and_have_the_same_optimum():
@@ -191,4 +191,4 @@ def settled(number):
 
 def test_the_plans_of_a_closed_loop_are_about_as_good_as_those_of_ipopt():
     good, bad = shares(settled(60))
-    assert good >= 0.7 and bad <= 0.15
+    assert good >= 0.85 and bad <= 0.05

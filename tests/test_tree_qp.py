@@ -153,8 +153,6 @@ def measured(shape, kind, number=EACH, plugins=("piqp",), seed=0):
 
 ONE_SIDED = ("branching twice, changes", "some bounds")
 BOTH_SIDED = [shape for shape in SHAPES if shape not in ONE_SIDED]
-# tree_qp.c masks a bound that is not there: where the other one is far away or its price far from the barrier, HPIPM's steps vanish
-MASKED = pytest.mark.xfail(strict=True, reason="HPIPM does not solve most of these with the missing bounds masked")
 
 
 def test_the_shapes_have_the_bounds_that_they_are_for():
@@ -169,7 +167,7 @@ def test_random_problems_against_piqp(kind):
     check(np.concatenate([measured(shape, kind) for shape in BOTH_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE))
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=MASKED) if k in ("violated", "crossing", "dear") else k for k in KINDS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_random_problems_with_one_sided_bounds_against_piqp(kind):
     check(np.concatenate([measured(shape, kind) for shape in ONE_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE))
 

@@ -21,6 +21,8 @@ def read_checkpoint(path, env, build):
         if data["format"] != FORMAT:
             raise ValueError("of another format")
         found = data["env"]
+        if not (isinstance(found, str) and found.isidentifier()):
+            raise ValueError("of no plant")
         if found == env:
             agent = build(data)
     except FileNotFoundError:

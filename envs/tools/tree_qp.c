@@ -30,7 +30,7 @@ typedef struct {
   struct d_tree_ocp_qp_ipm_arg arg;
   struct d_tree_ocp_qp_ipm_ws ws;
   int *row;
-  double *active, *scratch, *positive, *dx; /* (H)+ and dx of every edge */
+  double *scratch, *positive, *dx; /* (H)+ and dx of every edge */
   void *memory[16];
   int used;
 } tree_qp;
@@ -49,9 +49,9 @@ static int size(const tree_qp *self, int node) {
   return node == 0 ? 0 : self->nx + (self->changes && node < self->inner ? self->nu : 0);
 }
 
-/* parent, stage: of every node, the root's parent is -1; row: the bounded states; active: which bounds there are, (2, rows) */
+/* parent, stage: of every node, the root's parent is -1; row: the bounded states */
 tree_qp *tree_qp_new(int nodes, int inner, int nx, int nu, int rows, int changes, const int *parent, const int *stage, const int *row,
-                     const double *active, double tolerance, int most) {
+                     double tolerance, int most) {
   tree_qp *self = calloc(1, sizeof *self);
   self->nodes = nodes, self->inner = inner, self->nx = nx, self->nu = nu, self->rows = rows, self->changes = changes;
   struct node *node = take(self, nodes * sizeof *node);
@@ -83,7 +83,6 @@ tree_qp *tree_qp_new(int nodes, int inner, int nx, int nu, int rows, int changes
   self->positive = take(self, nodes * nx * nx * sizeof(double));
   self->dx = take(self, nodes * nx * sizeof(double));
   self->row = memcpy(take(self, rows * sizeof *row), row, rows * sizeof *row);
-  self->active = memcpy(take(self, 2 * rows * sizeof *active), active, 2 * rows * sizeof *active);
   int *index = take(self, wide * sizeof *index), *soft = take(self, (rows + 1) * sizeof *soft);
   for (int i = 0; i < wide; i++) index[i] = i;
   for (int i = 0; i < nodes; i++) {
@@ -100,8 +99,6 @@ tree_qp *tree_qp_new(int nodes, int inner, int nx, int nu, int rows, int changes
       d_tree_ocp_qp_set_Zu(i, self->scratch, &self->qp);
       d_tree_ocp_qp_set_lls(i, self->scratch, &self->qp);
       d_tree_ocp_qp_set_lus(i, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_lbx_mask(i, (double *)active, &self->qp);
-      d_tree_ocp_qp_set_ubx_mask(i, (double *)active + rows, &self->qp);
     }
   }
   return self;
@@ -183,8 +180,7 @@ static double cost_at(tree_qp *self, const double *du, const double *A, const do
     }
     for (int j = 0; j < rows; j++) {
       const double at = x[self->row[j]], *p = price + 2 * rows * e;
-      cost += self->active[j] * p[j] * fmax(x_low[rows * e + j] - at, 0);
-      cost += self->active[rows + j] * p[rows + j] * fmax(at - x_high[rows * e + j], 0);
+      cost += p[j] * fmax(x_low[rows * e + j] - at, 0) + p[rows + j] * fmax(at - x_high[rows * e + j], 0);
     }
   }
   return cost;

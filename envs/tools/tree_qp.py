@@ -13,6 +13,7 @@ from envs.tools.compiled import WHEEL, compiled
 
 TOLERANCE, MOST_ITERATIONS = 1e-9, 60
 RIDGE = 1e-8  # on du, that of tree_qp.c
+OUT_OF_REACH = 1e3  # half-widths of the box of initial states
 MAX_NODES = 20_000
 
 
@@ -84,9 +85,9 @@ class TreeQP:
         self.library.tree_qp_new.restype = ctypes.c_void_p
         self.row = np.flatnonzero(active.any(axis=0)).astype(np.int32)
         parent, stage = (np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage))
-        active = self.active = np.ascontiguousarray(active[:, self.row], dtype=float)
+        self.active = active[:, self.row]
         sizes = map(int, (len(parent), tree.inner, n_x, n_u, len(self.row), changes))
-        arrays = map(pointer, (parent, stage, self.row, active))
+        arrays = map(pointer, (parent, stage, self.row))
         new = self.library.tree_qp_new(*sizes, *arrays, ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
         self.instance = ctypes.c_void_p(new)
         self.free = weakref.finalize(self, self.library.tree_qp_free, self.instance)
@@ -97,12 +98,21 @@ class TreeQP:
         return self.counted.value
 
     def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier):
-        price = np.where(self.active > 0, price, 1.0)  # of a bound that is not there, too
-        arrays = [np.ascontiguousarray(a) for a in (A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved)]
+        bounds = two_sided(self.active, x_low, x_high, price)
+        arrays = [np.ascontiguousarray(a, dtype=float) for a in (A, B, slope, hessian, u_low, u_high, *bounds, change, moved)]
         status = self.library.tree_qp_solve(self.instance, *map(pointer, arrays), ctypes.c_double(barrier), pointer(self.du),
                                             ctypes.byref(self.cost), ctypes.byref(self.counted))  # fmt: skip
         solved = status == 0 and np.isfinite(self.du).all()
         return (self.du, self.cost.value) if solved else (None, np.nan)
+
+
+def two_sided(active, x_low, x_high, price):
+    """Bounds and prices with one out of reach, at the other's price, where there is none: solvers with masks or infinities do worse."""
+    if active.all():
+        return x_low, x_high, price
+    low = np.where(active[0], x_low, np.minimum(x_high, 0) - OUT_OF_REACH)
+    high = np.where(active[1], x_high, np.maximum(x_low, 0) + OUT_OF_REACH)
+    return low, high, np.where(active, price, np.asarray(price)[:, ::-1])
 
 
 def positive_part(hessian):
@@ -136,12 +146,12 @@ class ConicQP:
                    "g": ca.veccat(*dynamics, bounded + below, bounded - above)}  # fmt: skip
         quiet = {"highs": {"highs": {"output_flag": False}}, "qpoases": {"printLevel": "none"}}.get(plugin, {})
         self.solver = ca.qpsol("qp", plugin, problem, quiet | {"error_on_fail": False} | (options or {}))
-        self.unbounded = ~active[:, self.row]
+        self.active = active[:, self.row]
         self.square = edges, n_x, n_x
         self.zeros, self.shape, self.at = np.zeros(edges * n_x), (inner, n_u), edges * n_x
 
     def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier=None):
-        low, high = np.where(self.unbounded[0], -np.inf, x_low).ravel(), np.where(self.unbounded[1], np.inf, x_high).ravel()
+        low, high, price = (np.ravel(a) for a in two_sided(self.active, x_low, x_high, price))
         none, slack = np.full(low.size, np.inf), np.zeros(2 * low.size)
         found = self.solver(
             p=np.concatenate([np.ravel(a) for a in (A, B, slope, positive_part(np.reshape(hessian, self.square)), price, change, moved)]),
