@@ -544,6 +544,21 @@ def test_full_turns_of_an_angle_change_no_action(pendulum_checkpoint):
     assert np.ptp(actions[0]) > 0.1 and guesses[:6] == guesses[6:12] == guesses[12:]
 
 
+@pytest.mark.xfail(strict=True, reason="the turns are counted with rounded multiples of 2 pi; infinitely many are no number")
+@pytest.mark.parametrize("glitches", [[3e100], [1.7e308, -1.7e308]])
+def test_a_wrong_angle_is_forgotten(glitches):
+    """The next sound measurements are acted on as if it had not been there."""
+    x, g = ca.MX.sym("x", 6), ca.MX.sym("g", 2)
+    controller = ActorController(double_pendulum, ca.Function("mu", [x, g], [5 * ca.sin(x[1])]), double_pendulum.EVAL_GOAL)
+    state = double_pendulum.START.copy()
+    for angle in (0.1, *glitches, 0.1, 0.5, -0.5):
+        state[1] = angle
+        u = controller.make_step(state)
+        assert np.isfinite(u).all() and abs(u[0]) <= 5
+        if abs(angle) < 1:
+            assert u[0] == pytest.approx(5 * np.sin(angle), abs=1e-6)
+
+
 def test_a_goal_per_stage():
     """A constant one equals a single goal; a change that lies ahead is planned for."""
     actions = {}
@@ -769,7 +784,8 @@ def test_the_constructor_refuses_what_cannot_work(wrong, words):
         ("nominal_mpc", dict(deadline_ms=0.0), "--deadline-ms"),
         ("rl_mpc", dict(slack_weight=-2.0), "--slack-weight.*-2"),
         ("rl_mpc", dict(change_weight=(1.0,)), "--change-weight.*2 numbers"),
-        ("rl_mpc", dict(change_weight=(-1.0, 0.0)), "change_weight"),
+        ("rl_mpc", dict(change_weight=(-1.0, 0.0)), "--change-weight.*at least 0"),
+        ("rl_mpc", dict(change_weight=(np.inf, 0.0)), "--change-weight.*inf"),
         ("rl_mpc", dict(robust_horizon=5), "robust_horizon 5.*20000"),
         ("rl_mpc", dict(horizon=-1), "--horizon.*-1"),
         ("actor", dict(goal=(3.0,)), "goal"),
@@ -876,7 +892,8 @@ def test_the_compared_planners_solve_what_the_documentation_says(name):
     if name in ("nominal_mpc", "robust_mpc"):
         robust = name == "robust_mpc"
         price = np.minimum(cstr.BENCHMARK["slack_price"] * (9 if robust else 1), deploy.HARD_PRICE)
-        written = dict(stage=lambda x, g: (x[1] - g[0]) ** 2, change=cstr.BENCHMARK["change_weight"], robust_horizon=int(robust))
+        change = cstr.BENCHMARK["change_weight"] * (9 if robust else 1)  # prices count once per scenario
+        written = dict(stage=lambda x, g: (x[1] - g[0]) ** 2, change=change, robust_horizon=int(robust))
         horizon = 20
     else:
         written = dict(stage=lambda x, g: -np.exp(-((x[1] - g[0]) ** 2) / (2 * 0.2**2)), change=np.array([1e-4, 1e-8]))
