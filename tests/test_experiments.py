@@ -21,9 +21,9 @@ TABLES = sorted(path.name for path in (ROOT / "experiments/results").glob("*.csv
 FIGURES = sorted(path.name for path in (ROOT / "experiments/figures").iterdir())
 # measured with the planner before the present one, or not yet: their columns may differ, and figures that need the new ones are not redrawn
 EARLIER = {"cstr_tune", "cstr_critics", "cstr_literal", "cstr_frontier", "cstr_ablation", "cstr_shift", "benchmark_peers"}
-EARLIER |= {"solve_time_where", "solve_time_scaling", "reliability_controllers"}
+EARLIER |= {"reliability_controllers"}
 NOT_YET = {"cstr_ipopt", "cstr_branching", "cstr_stuck"}
-NOT_REDRAWN = {"cstr_deploy_critics", "cstr_deploy_literal", "cstr_deploy_ipopt", "cstr_deploy_branching", "benchmark_peers", "solve_time"}
+NOT_REDRAWN = {"cstr_deploy_critics", "cstr_deploy_literal", "cstr_deploy_ipopt", "cstr_deploy_branching", "benchmark_peers"}
 TEXT = {
     "case",
     "c_B",  # a path, as text
