@@ -115,13 +115,21 @@ def built(name):
     return controller, stopped_early(controller) if name in IPOPT else None
 
 
-def draw(plant, rng, far=False):
-    """Start state, goal (if far: one that not every scenario can hold) and plant parameters."""
+def draw(plant, rng):
+    """Start state, goal and plant parameters."""
     psi = rng.uniform(plant.EVAL_PSI.min(axis=0), plant.EVAL_PSI.max(axis=0))
     goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH)
-    while far and envs.can_hold(plant, goal):
-        goal = rng.uniform(plant.GOAL_LOW, plant.GOAL_HIGH)
     return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH), goal, psi
+
+
+def out_of_reach(controller, goal, rng):
+    """A goal that not every scenario can hold; goal_mpc.py, which takes any that is finite, gets one 2 to 10 ranges away."""
+    low, high = controller.plant.GOAL_LOW, controller.plant.GOAL_HIGH
+    if isinstance(controller, gm.ScenarioMPC):
+        return goal + (high - low) * rng.uniform(2, 10, size=goal.shape) * rng.choice([-1, 1], size=goal.shape)
+    while envs.can_hold(controller.plant, goal):
+        goal = rng.uniform(low, high)
+    return goal
 
 
 def spoil(controller, case, x, rng):
@@ -169,7 +177,8 @@ def closed_loop(cell):
     counts = collections.Counter({key: 0 for key in COUNTS})
     usual, lasting = getattr(controller, "solvers", None), case in LASTING
     for _ in range(max(steps // EPISODE, 1)):
-        x, goal, psi = draw(plant, rng, far=case == "goal out of reach")
+        x, goal, psi = draw(plant, rng)
+        goal = out_of_reach(controller, goal, rng) if case == "goal out of reach" else goal
         stop(controller, case if lasting else None, early, usual)
         controller.reset()
         controller.set_goal(goal)
