@@ -50,7 +50,8 @@ from envs.tools.tree_qp import ScenarioTree, tree_qp
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
 HARD_PRICE = 1e3  # of a hard bound per physical unit: above the multipliers, so that it is an exact penalty
 HARDLY_MOVED = 0.03  # half-widths of the box of initial states
-STATIONARY = 1e-4  # predicted decrease, share of the cost, of the step after which a plan is left as it is
+SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that lowers the cost as promised
+STATIONARY = 1e-4  # share of the cost: a plan whose cost came this close to the predicted one is left as it is
 Name = Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"]
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC"}
 LABELS |= {"goal_mpc": "RL+MPC, no value", "rl_mpc": "RL+MPC"}
@@ -207,7 +208,7 @@ class ScenarioMPC(Controller):
 
     - the plan satisfies the dynamics and the limits of the actions,
     - and costs no more than the cheapest finite first guess: the last plan shifted by a sampling time, where the
-      state has hardly moved also the last plan itself, and the policy's rollout (without one at first the middle).
+      state has hardly moved also the last plan itself, and the policy's rollout (without one every action's middle).
 
     Where no guess has a finite cost the policy acts, and where that is not finite the last action stays.
 
@@ -228,18 +229,23 @@ class ScenarioMPC(Controller):
         self, plant, horizon, scenarios, stage_cost, value=None, *, goal, robust_horizon=1, slack_price=1.0,
         change_weight=0.0, policy=None, expansion=None, estimator=None, iterations=5, deadline_ms=None, compile=True,
     ):  # fmt: skip
-        if not iterations >= 0 or not (deadline_ms is None or deadline_ms > 0):
-            raise ValueError(f"iterations is {iterations}, deadline_ms {deadline_ms}; they must be positive")
+        if not (isinstance(iterations, (int, np.integer)) and iterations >= 0):
+            raise ValueError(f"iterations is {iterations!r}; it must be a whole number of at least 0")
+        if not (deadline_ms is None or isinstance(deadline_ms, (int, float, np.number)) and deadline_ms > 0):
+            raise ValueError(f"deadline_ms is {deadline_ms!r}; it must be a positive number, or None")
         self.iterations, self.deadline_ms = iterations, deadline_ms
-        self.scenarios = np.array(scenarios if robust_horizon else scenarios[:1], dtype=float)
+        scenarios, n_psi = np.array(scenarios, dtype=float), len(plant.PSI_NOMINAL)
+        if scenarios.shape[1:] != (n_psi,) or not len(scenarios) or not np.isfinite(scenarios).all():
+            raise ValueError(f"scenarios have shape {scenarios.shape}; they must be finite, (S, {n_psi})")
+        self.scenarios = scenarios if robust_horizon else scenarios[:1]
         self.horizon, self.tree = horizon, ScenarioTree(len(self.scenarios), horizon, robust_horizon)
         self.x_center, self.x_scale, self.u_center, self.u_scale = scaling(plant)
         self.policy = policy
         # prices per scaled unit; states without a bound or a price are left out
         price, change_weight = np.array(slack_price, dtype=float), np.array(change_weight, dtype=float)
-        if not ((price >= 0).all() and (change_weight >= 0).all()):  # nor nan
+        if not ((price >= 0).all() and (change_weight >= 0).all() and np.isfinite(change_weight).all()):  # nor nan
             weights = f"slack_price is {price.tolist()}, change_weight {change_weight.tolist()}"
-            raise ValueError(f"{weights}; they must not be negative")
+            raise ValueError(f"{weights}; they must not be negative, the second finite")
         bounds = (np.array([plant.X_LOW, plant.X_HIGH]) - self.x_center) / self.x_scale
         active = np.isfinite(bounds) & (price > 0)
         self.rows = np.flatnonzero(active.any(axis=0))
@@ -338,12 +344,12 @@ class ScenarioMPC(Controller):
     def belief(self, x):
         """Of every scenario the state that it starts from (S, n_x), parameters (S, n_psi), weight (S,)."""
         S = len(self.scenarios)
-        return np.tile(x, (S, 1)), self.scenarios + self.estimator.shift, np.full(S, 1 / S)
+        return np.repeat([x], S, axis=0), self.scenarios + self.estimator.shift, np.full(S, 1 / S)
 
     def _problem(self, x):
         """Parameters of the compiled functions, a row per column of theirs."""
         starts, psi, weight = self.belief(x)
-        goal = np.broadcast_to(self.goal.reshape(len(self.goal), -1), (len(self.goal), self.horizon)).T
+        goal = self.goal.reshape(len(self.goal), -1).T
         u_before = (self.u_before - self.u_center) / self.u_scale
         known = (starts - self.x_center) / self.x_scale, psi, self.tree.weights(weight)[:, None], goal
         known += self.estimator.disturbance, self.estimator.mismatch
@@ -357,20 +363,22 @@ class ScenarioMPC(Controller):
             # where things move, an action that is planned for later would be put off for ever
             if np.abs((x - self.x_before) / self.x_scale).max() < HARDLY_MOVED:
                 found["last"] = self.plan
+        if self.policy is None:
+            found["middle"] = np.zeros((self.tree.inner, len(self.u_scale)))
         for follow in self.follow:
             found["policy"] = follow(*self.problem)[0].copy()
-        return found or {"middle": np.zeros((self.tree.inner, len(self.u_scale)))}
+        return found
 
     def _cost(self, u):
         """Cost of a plan; not a number if a state of it is not finite."""
         J, states = self.rollout(*self.problem, u)
         return J.item() if np.isfinite(states).all() else np.nan
 
-    def _improve(self, u, cost, tick):
+    def improve(self, u, cost, tick):
         """The plan u after as many iterations as it may have, and its cost."""
-        parent, u_before, weight = self.tree.parent[1 : self.tree.inner], self.problem[-1], self.problem[2]
+        weight, u_before = self.problem[2], self.problem[-1]
         change, price = weight[: self.tree.inner] * self.change_weight, weight[1:, :, None] * self.slack_price
-        barrier = max(price.max(initial=0), 1.0)
+        parent, barrier = self.tree.parent[1 : self.tree.inner], max(price.max(initial=0), 1.0)
         for _ in range(self.iterations):
             if self.deadline_ms is not None and 1e3 * (time.perf_counter() - tick) > self.deadline_ms:
                 self.stats |= {"stop": "late", "late": True}
@@ -378,23 +386,24 @@ class ScenarioMPC(Controller):
             self.stats["iterations"] += 1
             states, A, B, slope, hessian = self.linearise(*self.problem, u)
             low, high = self.low - states[:, self.rows], self.high - states[:, self.rows]
-            slope, hessian = slope * weight[1:], hessian * np.repeat(weight[1:], slope.shape[1], axis=0)
-            bounds, moved = (-1 - u, 1 - u, low, high), u - np.vstack([u_before, u[parent]])
+            slope, hessian = slope * weight[1:], hessian.reshape(len(price), -1) * weight[1:]
+            bounds, moved = (-1 - u, 1 - u, low, high), u - np.concatenate([u_before[None], u[parent]])
             step, found = self.qp.solve(A, B, slope, hessian, *bounds, price, change, moved, barrier)
             if step is None:
                 self.stats["stop"] = "unsolved"
                 break
-            slack = (price * np.maximum(np.stack([low, -high], axis=1), 0)).sum()
+            slack = np.vdot(price[:, 0], np.maximum(low, 0)) + np.vdot(price[:, 1], np.maximum(-high, 0))
             self.stats["predicted"] = predicted = slack - found
-            small, before = not predicted > STATIONARY * (1 + abs(cost)), cost
-            for share in 0.5 ** np.arange(6):
+            worth, before = STATIONARY * abs(cost), cost
+            for share in SHARES if predicted > worth else SHARES[:1]:
                 new = np.clip(u + share * step, -1, 1)
                 new_cost = self._cost(new)
                 if new_cost < before and not before - new_cost < 0.1 * share * predicted:
                     u, cost = new, new_cost
                     break
-            if small or cost == before:
-                self.stats["stop"] = "stationary" if small else "stalled"
+            as_predicted = abs(before - cost - predicted) <= worth
+            if as_predicted or cost == before:
+                self.stats["stop"] = "stationary" if as_predicted else "stalled"
                 break
         return u, cost
 
@@ -409,7 +418,7 @@ class ScenarioMPC(Controller):
             return np.array(u).ravel()
         best = min(costs, key=costs.get)
         self.stats |= dict(rung="plan", guess=best, guess_cost=costs[best], stop="limit", predicted=0.0)
-        self.plan, self.stats["cost"] = self._improve(guesses[best], costs[best], tick)
+        self.plan, self.stats["cost"] = self.improve(guesses[best], costs[best], tick)
         return self.plan[0] * self.u_scale + self.u_center
 
     def prediction(self):

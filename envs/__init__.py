@@ -234,7 +234,7 @@ def checked_state(plant, x0):
     if x0.shape != plant.X_LOW.shape:
         raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
     if not np.isfinite(x0).all():
-        raise ValueError(f"state is {x0}; every entry must be finite")
+        raise ValueError(f"state is {np.array2string(x0, threshold=8)}; every entry must be finite")
     return x0
 
 

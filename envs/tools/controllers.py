@@ -47,9 +47,10 @@ class Controller:
         Raises ValueError for a state that is not one and stays as it was. Angles are taken to the turn nearest to the last.
         """
         x, tick = envs.checked_state(self.plant, x0), time.perf_counter()
+        angles, turn = self.plant.ANGLES, 2 * np.pi
+        x[angles] = np.fmod(x[angles], turn)  # turns would take the digits of what is far away
         if self.x_before is not None:
-            turns = np.round((self.x_before - x) / (2 * np.pi))
-            x[self.plant.ANGLES] += 2 * np.pi * turns[self.plant.ANGLES]
+            x[angles] += turn * np.round((self.x_before - x)[angles] / turn)
         self.estimator.update(x)
         self.stats = {"rung": "actor", "fell_back": False, "iterations": 0, "late": False}
         u = self.action(x, tick)

@@ -26,11 +26,12 @@ class ScenarioTree:
     """
 
     def __init__(self, scenarios, horizon, robust_horizon):
-        if horizon < 1 or robust_horizon < 0:
-            raise ValueError(f"horizon is {horizon}, robust_horizon {robust_horizon}; they must be at least 1 and 0")
+        whole = all(isinstance(number, (int, np.integer)) for number in (horizon, robust_horizon))
+        if not whole or horizon < 1 or robust_horizon < 0:
+            raise ValueError(f"horizon is {horizon!r}, robust_horizon {robust_horizon!r}; they must be whole and at least 1 and 0")
         leaves = scenarios ** min(robust_horizon, horizon)
         if leaves * horizon > MAX_NODES:
-            raise ValueError(f"robust_horizon {robust_horizon} gives {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
+            raise ValueError(f"a robust horizon of {robust_horizon} gives {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
         self.nodes = [scenarios ** min(t, robust_horizon) for t in range(horizon + 1)]
         self.first = np.cumsum([0, *self.nodes])
         self.inner = int(self.first[horizon])
@@ -91,7 +92,13 @@ class TreeQP:
         new = self.library.tree_qp_new(*sizes, *arrays, ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
         self.instance = ctypes.c_void_p(new)
         self.free = weakref.finalize(self, self.library.tree_qp_free, self.instance)
-        self.du, self.cost, self.counted = np.zeros((tree.inner, n_u)), ctypes.c_double(), ctypes.c_int()
+        # what `solve` takes, in memory that stays where it is
+        edges, rows, inner = len(parent) - 1, len(self.row), (tree.inner, n_u)
+        shapes = [(edges, n_x * n_x), (edges, n_x * n_u), (edges, n_x), (edges, n_x * n_x), inner, inner]
+        shapes += [(edges, rows), (edges, rows), (edges, 2, rows), inner, inner]
+        self.given, self.du, self.cost, self.counted = list(map(np.zeros, shapes)), np.zeros(inner), ctypes.c_double(), ctypes.c_int()
+        self.memory = list(map(pointer, self.given))
+        self.found = pointer(self.du), ctypes.byref(self.cost), ctypes.byref(self.counted)
 
     @property
     def iterations(self):
@@ -99,9 +106,9 @@ class TreeQP:
 
     def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier):
         bounds = two_sided(self.active, x_low, x_high, price)
-        arrays = [np.ascontiguousarray(a, dtype=float) for a in (A, B, slope, hessian, u_low, u_high, *bounds, change, moved)]
-        status = self.library.tree_qp_solve(self.instance, *map(pointer, arrays), ctypes.c_double(barrier), pointer(self.du),
-                                            ctypes.byref(self.cost), ctypes.byref(self.counted))  # fmt: skip
+        for kept, value in zip(self.given, (A, B, slope, hessian, u_low, u_high, *bounds, change, moved)):
+            kept[...] = np.reshape(value, kept.shape)
+        status = self.library.tree_qp_solve(self.instance, *self.memory, ctypes.c_double(barrier), *self.found)
         solved = status == 0 and np.isfinite(self.du).all()
         return (self.du, self.cost.value) if solved else (None, np.nan)
 
