@@ -32,8 +32,7 @@ from envs.tools.expansion import expansion
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
 # what rows depend on, read when it is imported: an edit while loops run does not file old results under new code
-FILES = [*(HERE.parent / "envs").glob("tools/*.[cp]*"), *(module.__file__ for module in (literal, deploy, gm, envs, cstr)), __file__]
-INPUTS = [Path(file).read_bytes() for file in sorted(map(str, FILES))]
+INPUTS = [Path(module.__file__).read_bytes() for module in (sys.modules[__name__], literal, deploy, gm, envs, cstr)]
 BLOCK = 25  # draws per cell
 
 

@@ -4,7 +4,7 @@
     python experiments/solve_time.py --plot-only        # redraw from the committed CSV
 
 `where`: closed loops over the paired draws of rl_mpc_deploy.py, with a clock around every call of a compiled function and of the solver of
-quadratic programs; what remains of make_step is Python. `scaling`: cold solves of RL+MPC from the same start states, by horizon (9
+quadratic programs; what remains of make_step is Python. `scaling`: cold solves of RL+MPC from the same start states, in turn, by horizon (9
 scenarios) and by the number of scenarios (N = 5), from square grids over the box of parameters; the time per iteration is that of
 linearisation, quadratic program and line search.
 
@@ -134,21 +134,24 @@ def scaling(args):
     todo = [("horizon", n, 3) for n in HORIZONS] + [("scenarios", 5, k) for k in GRIDS]
     if args.quick:
         todo = [("horizon", 1, 3), ("horizon", 2, 3), ("scenarios", 1, 1), ("scenarios", 1, 2)]
-    shipped, rows = cstr.SCENARIOS["mpc"], []
-    starts = envs.sample_states(cstr, np.random.default_rng([args.seed, 6]), args.episodes)
-    for axis, n, k in tqdm(todo, desc="scaling", disable=None):
+    shipped, planners = cstr.SCENARIOS["mpc"], []
+    for axis, n, k in todo:
         cstr.SCENARIOS["mpc"] = grid(k)
         try:
             mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, compile=not args.quick))
         finally:
             cstr.SCENARIOS["mpc"] = shipped
-        spent, log = clocked(mpc), []
-        for x in starts:
+        planners.append((mpc, clocked(mpc), []))
+    starts = envs.sample_states(cstr, np.random.default_rng([args.seed, 6]), args.episodes)
+    for x in tqdm([x for _ in range(3) for x in starts], desc="scaling", disable=None):
+        for mpc, spent, log in planners:  # in turn, so that what disturbs one disturbs all
             mpc.reset()
             spent.clear()
             mpc.make_step(x)
             iterating = sum(spent[key] for key in ("linearise_ms", "qp_ms", "search_ms"))
             log.append((mpc.stats["wall_ms"], iterating, mpc.stats["iterations"]))
+    rows = []
+    for (axis, n, k), (mpc, _, log) in zip(todo, planners):
         ms, iterating, iterations = np.transpose(log)
         rows.append({"axis": axis, "horizon": n, "scenarios": k * k, "nodes": len(mpc.tree.stage) - 1, "ms_median": round(np.median(ms), 3),
                      "iterations_median": np.median(iterations), "ms_per_iteration": round(np.median(iterating / iterations), 4),

@@ -57,6 +57,14 @@ def mpc(horizon=3, scenarios=cstr.SCENARIOS["mpc"], stage=None, value=None, goal
     return kind(cstr, horizon, scenarios, stage or casadi_stage(cstr), value, **dict(goal=goal, compile=False) | options)
 
 
+class Shifted(deploy.ScenarioMPC):
+    """Guesses the shifted plan alone where there is one."""
+
+    def _guesses(self, x):
+        found = super()._guesses(x)
+        return {"shifted": found["shifted"]} if "shifted" in found else found
+
+
 def solve(controller, x0=X0, iterations=100):
     controller.iterations = iterations
     u = controller.make_step(x0)
@@ -193,7 +201,7 @@ def test_every_leaf_counts(robust_horizon, checkpoint):
     """The terminal cost alone: the parameters of any one scenario change a plan's cost, and a plan costs what the definition says."""
     critic = deploy.load_critic(checkpoint, "cstr")
     V, psi = deploy.export(critic)[2], cstr.SCENARIOS["mpc"][[0, 4, 8]]
-    options = dict(robust_horizon=robust_horizon, slack_price=0.0, iterations=0)
+    options = dict(kind=Shifted, robust_horizon=robust_horizon, slack_price=0.0, iterations=0)
     controller = mpc(2, psi, of_state(lambda x: 0 * x[0]), V, **options)
     assert controller.tree.nodes == ([1, 3, 3] if robust_horizon == 1 else [1, 3, 9])
     plan = np.random.default_rng(0).uniform(-1, 1, size=(controller.tree.inner, 2))
@@ -604,7 +612,7 @@ def test_a_goal_that_is_none_is_refused_and_leaves_the_last_one(goal):
     np.testing.assert_array_equal(controller.make_step(X0), mpc(4, scenarios=cstr.PSI_NOMINAL[None]).make_step(X0))
 
 
-class Believing(deploy.ScenarioMPC):
+class Believing(Shifted):
     """Weights, and states to start from, that a test chooses."""
 
     given = starts = None
