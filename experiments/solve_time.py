@@ -28,10 +28,11 @@ import matplotlib.pyplot as plt
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 import cells
+import literal
 
 import envs
 import rl_mpc_deploy as deploy
-from envs import cstr
+from envs import cstr, double_pendulum
 
 CONTROLLERS = {  # label: (name, keywords of rl_mpc_deploy.Args)
     "RL+MPC, N = 1": ("rl_mpc", dict(horizon=1)),
@@ -41,6 +42,8 @@ CONTROLLERS = {  # label: (name, keywords of rl_mpc_deploy.Args)
     "RL+MPC, N = 10": ("rl_mpc", dict(horizon=10)),
     "robust MPC, N = 20": ("robust_mpc", {}),
     "robust MPC, N = 20, one iteration": ("robust_mpc", dict(iterations=1)),
+    "pendulum, no value, N = 20": ("pendulum", dict(horizon=20, robust_horizon=0)),
+    "pendulum, no value, N = 20, 27 scenarios": ("pendulum", dict(horizon=20)),
 }
 HORIZONS, GRIDS = (1, 2, 5, 10, 20), (1, 2, 3, 5, 7)  # grids of k x k parameters
 PARTS = {  # column: (label, colour)
@@ -95,19 +98,27 @@ def clocked(mpc):
     return spent
 
 
+def pendulum(horizon, robust_horizon=1, compile=True):
+    """Goal-conditioned MPC of the double pendulum."""
+    plant = double_pendulum
+    options = dict(goal=plant.EVAL_GOAL, robust_horizon=robust_horizon, slack_price=10.0, compile=compile)
+    return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], literal.gaussian(plant), **options)
+
+
 def where(args):
     """Rows: averages per step, over all steps, of every controller, and quantiles of a whole step."""
     rows = []
     for label, (name, options) in CONTROLLERS.items():
-        mpc = deploy.build_controller(name, deploy.Args(**options, compile=not args.quick))
-        spent = clocked(mpc)
-        starts, psi = deploy.draws(cstr, args.episodes, args.seed)
+        options |= {"compile": not args.quick}
+        mpc = pendulum(**options) if name == "pendulum" else deploy.build_controller(name, deploy.Args(**options))
+        spent, plant = clocked(mpc), mpc.plant
+        starts, psi = deploy.draws(plant, args.episodes, args.seed)
         log = []
         for i in tqdm(range(args.episodes), desc=label, disable=None):
             mpc.reset()
             x = starts[i]
             for _ in range(args.steps):
-                x = cstr.step(x, mpc.make_step(x), psi[i])
+                x = plant.step(x, mpc.make_step(x), psi[i])
                 log.append(mpc.stats)
         milliseconds = np.array([stats["wall_ms"] for stats in log])
         n = len(log)
@@ -205,13 +216,13 @@ def main(args):
         cells.write(scaling(args), args.out / "results/solve_time_scaling.csv")
     where_rows, scaling_rows = (cells.read(args.out / f"results/solve_time_{name}.csv") for name in ("where", "scaling"))
     print(
-        f"{'':36s}{'step, ms: mean  median     p95   99.9 %     max':48s}  SQP, QP iterations  "
+        f"{'':44s}{'step, ms: mean  median     p95   99.9 %     max':48s}  SQP, QP iterations  "
         + "  ".join(label for label, _ in PARTS.values())
     )
     for row in where_rows:
         step = "".join(f"{float(row[f'step_ms_{key}']):9.2f}" for key in ("mean", "median", "p95", "p999", "max"))
         parts = "".join(f"{float(row[key]):9.2f}" for key in PARTS)
-        print(f"{row['controller']:36s}{step}{float(row['iterations_mean']):9.1f}{float(row['qp_iterations_mean']):6.1f}   {parts}")
+        print(f"{row['controller']:44s}{step}{float(row['iterations_mean']):9.1f}{float(row['qp_iterations_mean']):6.1f}   {parts}")
     for axis in ("horizon", "scenarios"):
         mine = [row for row in scaling_rows if row["axis"] == axis]
         print(f"{axis}: " + ", ".join(f"{row[axis]}: {float(row['ms_per_iteration']):.2f}" for row in mine)
