@@ -46,6 +46,21 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     return x, u, row
 
 
+def read_trajectories(path, plant):
+    """States (E, T + 1, n_x) and actions (E, T, n_u) of every controller in a trajectories.npz. Raises ValueError."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            x, u = (np.concatenate([data[name] for name in sorted(data.files) if name.endswith(end)]) for end in ("_x", "_u"))
+        if not (x.shape[0], x.shape[1] - 1, *x.shape[2:], u.shape[2]) == (*u.shape[:2], len(plant.X_LOW), len(plant.U_LOW)):
+            raise ValueError
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            raise ValueError
+    except Exception as error:  # missing, truncated, not an archive, of another plant: one sentence for all of them
+        reason = f"not a trajectories.npz of {plant.ENV_ID} ({type(error).__name__})" if path.exists() else "does not exist"
+        raise ValueError(f"{path}: {reason}") from None
+    return x, u
+
+
 def parallel(function, jobs, processes, first=0):
     """[function(*job) for job in jobs] over processes; the `first` ones are done before the others begin."""
     # else CasADi would take Ctrl-C for a failed evaluation, and torch does not survive a fork
