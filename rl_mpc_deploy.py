@@ -579,7 +579,7 @@ def main(args):
         print("notice: robust MPC is left out; with a single scenario it is nominal MPC", file=sys.stderr)
     if not envs.can_hold(plant, goal):
         print(f"warning: --goal {args.goal} is not a goal that every scenario can hold", file=sys.stderr)
-    out = output_folder(args.out, f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
+    out = output_folder(args.out, Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
     difference = check_export(critic, export(critic)[2])
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}", flush=True)
     tick = time.perf_counter()

@@ -41,7 +41,7 @@ from tqdm import tqdm
 import envs
 from envs.tools.arguments import check_effects, check_ranges
 from envs.tools.checkpoint import FORMAT, RESUME, plain, read_checkpoint, read_file, save
-from envs.tools.comparison import read_trajectories, write_csv
+from envs.tools.comparison import output_folder, read_trajectories, write_csv
 from envs.tools.evaluation import evaluation_row, evaluation_table
 from envs.tools.interrupt import until_interrupted
 from envs.tools.scaling import Scaling
@@ -240,7 +240,9 @@ def load_policy(path):
         critic.load_state_dict(data["critic"], assign=True)
         networks = actor.float(), critic.float()
         policy = Policy(plant, *networks, Scaling(**data["scaling"]), data["goal_input"])
-        if not np.isfinite(policy.value(plant.START, plant.EVAL_GOAL)).all():
+        if not np.isfinite(
+            policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)
+        ).all():
             raise ValueError("values that are not finite")
         return policy
 
@@ -462,7 +464,7 @@ def main(args, kind=SAC):
     plant = check(args)
     plant_data = read_trajectories(args.add_plant_data, plant) if args.add_plant_data and not source else None
     name = f"{args.env}__sac_her_branching__{args.seed}__{int(time.time())}"
-    run_dir = source.parent if source else envs.new_folder(args.out / name)
+    run_dir = output_folder(source and source.parent, args.out / name)
     run = Progress(**state["progress"]) if source else Progress(returns=[0.0] * args.num_envs)
     writer = SummaryWriter(run_dir, purge_step=run.step + 1 if source else None)
     lines = [f"|{name}|{value}|" for name, value in plain(args).items()]
@@ -553,6 +555,6 @@ def main(args, kind=SAC):
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -117,7 +117,7 @@ def torch_critic(critic):
 @pytest.fixture(scope="module")
 def pendulum_checkpoint(tmp_path_factory):
     args = training.Args(env="double_pendulum", seed=1, hidden=(32, 32))
-    agent, generator = training.SAC(args, double_pendulum, torch.device("cpu")), torch.Generator().manual_seed(0)
+    agent, generator = training.SAC(args, double_pendulum), torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:
             parameter += 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])

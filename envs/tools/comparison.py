@@ -80,14 +80,14 @@ def parallel(function, jobs, processes, first=0):
     return [future.result() for future in futures]
 
 
-def output_folder(out, name):
-    """The folder `out`, or runs/NAME, made and tried. Raises ValueError where it cannot be written."""
+def output_folder(out, otherwise):
+    """The folder `out`, or a new one at the path `otherwise`, made and tried. Raises ValueError where it cannot be written."""
     try:
-        folder = out or envs.new_folder(Path("runs") / name)
+        folder = out or envs.new_folder(otherwise)
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ValueError(f"--out {out or 'runs'}: cannot write there ({error.strerror})") from None
+        raise ValueError(f"--out {out or otherwise.parent}: cannot write there ({error.strerror})") from None
     return folder
 
 

@@ -46,5 +46,5 @@ def evaluation_table(row):
     lines = ["median [75th percentile] over starts      error, %      time outside constraints, %"]
     for name in ("robust", "nominal"):
         columns = [(row[f"{name}_median_{key}"], row[f"{name}_p75_{key}"]) for key in ("ape", "outside")]
-        lines.append(f"{name:7s} evaluation" + "".join(f"{median:20.2f} [{p75:6.2f}]" for median, p75 in columns))
+        lines.append(f"{name} evaluation".ljust(20) + "".join(f"{median:17.2f} [{p75:6.2f}]" for median, p75 in columns))
     return "\n".join(lines)
