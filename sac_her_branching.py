@@ -40,11 +40,11 @@ from tqdm import tqdm
 
 import envs
 from envs.tools.arguments import check_effects, check_ranges
-from envs.tools.checkpoint import FORMAT, RESUME, plain, read_checkpoint, read_file, save
+from envs.tools.checkpoint import FORMAT, RESUME, plain, read_file, save
 from envs.tools.comparison import output_folder, read_trajectories, write_csv
 from envs.tools.evaluation import evaluation_row, evaluation_table
 from envs.tools.interrupt import until_interrupted
-from envs.tools.scaling import Scaling
+from envs.tools.policy import Policy, Scaling, read_policy
 
 # of the arguments that a plant's TRAINING may set
 DEFAULTS = dict(hidden=(64, 64), total_timesteps=100_000, num_envs=32, gamma=0.99, steps_per_update=8)
@@ -127,17 +127,16 @@ class Args:
     """folder that the run's own folder is made in"""
 
     def __post_init__(self):
-        """Arguments left out take the plant's value; those of files take their types."""
+        """Arguments left out take the plant's value, all of them plain types."""
+        defaults = DEFAULTS | envs.load(self.env).TRAINING if self.env in envs.names() else {}
+        if self.observe_mismatch and defaults:
+            defaults["gamma"] = min(defaults["gamma"], 0.95)
+        for name, value in vars(self).items():
+            value = defaults.get(name) if value is None else value
+            setattr(self, name, value.item() if isinstance(value, np.generic) else value)
         self.out = Path(self.out)
-        self.add_plant_data = None if self.add_plant_data is None else Path(self.add_plant_data)
-        if self.env in envs.names():
-            defaults = DEFAULTS | envs.load(self.env).TRAINING
-            if self.observe_mismatch:
-                defaults["gamma"] = min(defaults["gamma"], 0.95)
-            for name, value in defaults.items():
-                if getattr(self, name) is None:
-                    setattr(self, name, value)
-        self.hidden = self.hidden and tuple(self.hidden)
+        self.add_plant_data = self.add_plant_data and Path(self.add_plant_data)
+        self.hidden = self.hidden and tuple(map(int, self.hidden))
 
     @property
     def plant_options(self):
@@ -202,51 +201,9 @@ class TwinCritic(nn.Module):
         return torch.baddbmm(b_out, h, w_out).squeeze(-1)
 
 
-class Policy:
-    """A trained agent for people: batched numpy arrays in physical units. x: (n_x,) or (B, n_x), what the agent observes."""
-
-    def __init__(self, plant, actor, critic, scaling, goal_input):
-        self.plant, self.actor, self.critic = plant, actor, critic
-        self.scaling, self.goal_input = scaling, goal_input
-
-    def features(self, x, goal):
-        x, goal = (torch.atleast_2d(torch.as_tensor(v, dtype=torch.float32)) for v in (x, goal))
-        return self.scaling.features(x, goal.expand(len(x), -1), self.goal_input)
-
-    def physical(self, action):
-        """Actions in [-1, 1] in physical units, numpy."""
-        return (action * self.scaling.u_scale + self.scaling.u_center).numpy()
-
-    @torch.no_grad()
-    def act(self, x, goal):
-        """Deterministic action mu(x, goal), (B, n_u); goal (n_goal,) or (B, n_goal)."""
-        return self.physical(self.actor.act(self.features(x, goal)))
-
-    @torch.no_grad()
-    def value(self, x, goal):
-        """V(x, goal) = min_j Q_j(x, mu(x, goal), goal), (B,), with SAC's entropy bonus unless trained without."""
-        z = self.features(x, goal)
-        return self.critic(z, self.actor.act(z)).amin(0).numpy()
-
-
 def load_policy(path):
     """The agent stored in a checkpoint.pt, which is data, never code. Raises ValueError for anything else."""
-
-    def build(data):
-        plant = envs.load(data["env"], **data["plant_options"])
-        with torch.device("meta"):  # no memory until the file's own weights are put in, if they fit
-            actor, critic = Actor(**data["network"]), TwinCritic(**data["network"])
-        actor.load_state_dict(data["actor"], assign=True)
-        critic.load_state_dict(data["critic"], assign=True)
-        networks = actor.float(), critic.float()
-        policy = Policy(plant, *networks, Scaling(**data["scaling"]), data["goal_input"])
-        if not np.isfinite(
-            policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)
-        ).all():
-            raise ValueError("values that are not finite")
-        return policy
-
-    return read_checkpoint(path, None, build)
+    return read_policy(path, Actor, TwinCritic)
 
 
 # Replay with hindsight
@@ -448,6 +405,8 @@ def check(args):
         raise ValueError(f"--branches is {args.branches}; it must be 1 with {names}")
     if args.observe_mismatch and args.add_plant_data:
         raise ValueError("--add-plant-data does not go with --observe-mismatch, which its states lack")
+    if args.learning_starts >= args.total_timesteps:
+        print("warning: nothing is learnt, --learning-starts is not below --total-timesteps", file=sys.stderr)
     unused = {"reward_tolerance": "with --smooth-reward" if args.smooth_reward else ""}
     unused |= {"reward_sigma2": "" if args.smooth_reward else "with --no-smooth-reward"}
     check_effects(args, unused | {"her_strategy": "" if args.her_ratio else "with --her-ratio 0"})

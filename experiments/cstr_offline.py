@@ -36,7 +36,7 @@ import envs
 import sac_her_branching as sac
 from envs import cstr
 from envs.tools.evaluation import evaluate
-from envs.tools.scaling import Scaling
+from envs.tools.policy import Scaling
 
 STUDIES = {  # label: arguments of sac_her_branching.py
     "agents": {"robust": {}, "nominal": {"scenarios": "nominal"}},

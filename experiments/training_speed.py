@@ -37,7 +37,7 @@ import envs
 import sac_her_branching as sac
 from envs import cstr
 from envs.tools.evaluation import evaluation_row
-from envs.tools.scaling import Scaling
+from envs.tools.policy import Scaling
 
 VARIANTS = {  # of the arguments of sac_her_branching.py
     "default": [],

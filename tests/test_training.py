@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -213,6 +214,30 @@ def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(tmp_path, mo
         return [{k: v for k, v in row.items() if k != "train_seconds"} for row in csv.DictReader(open(path))]
 
     assert without_times(whole / "evaluations.csv") == without_times(resumed / "evaluations.csv")
+
+
+def test_whatever_comes_in_is_saved_as_plain_data(tmp_path):
+    numbers = dict(learning_rate=np.float64(1e-3), gamma=np.float32(0.5), hidden=[np.int64(8), 8], seed=np.int64(1))
+    run = training.main(small(str(tmp_path), total_timesteps=320, learning_starts=160, **numbers))
+    data = torch.load(run / "checkpoint.pt", weights_only=True)
+    assert data["args"]["learning_rate"] == 1e-3 and data["gamma"] == 0.5 and data["network"]["hidden"] == [8, 8]
+    assert training.load_policy(run / "checkpoint.pt").act(envs.load("cstr").START, 0.65).shape == (1, 2)
+    assert training.main(training.Args(resume=run / "resume.pt")) == run
+
+
+def test_it_trains_outside_of_the_main_thread(tmp_path):
+    with ThreadPoolExecutor(1) as pool:
+        run = pool.submit(training.main, small(tmp_path, total_timesteps=320, learning_starts=160)).result()
+    assert (run / "resume.pt").exists()
+
+
+def test_the_return_that_is_logged_counts_the_price_of_constraints(plant):
+    agent = training.SAC(training.Args(constraint_weight=3.0), plant)
+    x = envs.sample_states(plant, np.random.default_rng(0), 5) + [0.0, 0.0, 30.0, 0.0]
+    goal = np.full((5, 1), 0.65)
+    expected = envs.goal_reward(plant, x[:, [1]], goal) + 3 * envs.outside_constraints(plant, x)
+    np.testing.assert_allclose(agent.reward(x, goal, np), expected)
+    np.testing.assert_allclose(agent.reward(torch.tensor(x), torch.tensor(goal), torch), expected)
 
 
 def test_it_learns(tmp_path):
