@@ -5,7 +5,6 @@ import multiprocessing
 import signal
 import tempfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
