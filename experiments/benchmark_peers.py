@@ -289,7 +289,8 @@ def plot(rows, path):
             median, p95, failed = (float(row.get(f"{side}_{key}", 0)) for key in ("ms_median", "ms_p95", "failed"))
             ax.plot([median, p95], [y, y], color=colour, lw=2.5)
             ax.plot(median, y, "o", color=colour, mec="black", mew=0.5, ms=6)
-            words = (f"{median:.0f} ms" if median >= 100 else f"{median:.3g} ms") + (f", {failed:.0f} of {int(row['starts']) * int(row['steps'])} failed" if failed else "")
+            words = f"{median:.0f} ms" if median >= 100 else f"{median:.3g} ms"
+            words += f", {failed:.0f} of {int(row['starts']) * int(row['steps'])} failed" if failed else ""
             ax.annotate(words, (p95, y), xytext=(6, 0), textcoords="offset points", va="center", fontsize=8)
         else:
             ax.annotate("not installed", (1, y), va="center", fontsize=8)

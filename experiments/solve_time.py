@@ -146,7 +146,7 @@ def scaling(args):
     if args.quick:
         todo = [("horizon", 1, 3), ("horizon", 2, 3), ("scenarios", 1, 1), ("scenarios", 1, 2)]
     shipped, planners = cstr.SCENARIOS["mpc"], []
-    for axis, n, k in todo:
+    for _, n, k in todo:
         cstr.SCENARIOS["mpc"] = grid(k)
         try:
             mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=n, compile=not args.quick))
