@@ -83,9 +83,7 @@ def read_policy(path, actor_class, critic_class):
         critic.load_state_dict(data["critic"], assign=True)
         networks = actor.float(), critic.float()
         policy = Policy(plant, *networks, Scaling(**data["scaling"]), data["goal_input"])
-        if not np.isfinite(
-            policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)
-        ).all():
+        if not np.isfinite(policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)).all():
             raise ValueError("values that are not finite")
         return policy
 
