@@ -118,8 +118,8 @@ class ScenarioCritics(sac.SAC):
         pairs, batch = len(self.scenarios), len(x)
         with torch.no_grad():
             g = goal.repeat(pairs, 1)  # (pairs * B, n_goal), scenario after scenario, as everything below
-            x_next = self.plant.step(*(v.repeat(pairs, 1).cpu().numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0))
-            x_next = torch.as_tensor(x_next, dtype=torch.float32, device=self.device)
+            x_next = self.plant.step(*(v.repeat(pairs, 1).numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0))
+            x_next = torch.as_tensor(x_next, dtype=torch.float32)
             z = self.features(x_next, g)
             action, log_prob = self.actor.sample(z, self.generator)
             reward = envs.goal_reward(self.plant, x_next[:, self.scaling.goal_index], g, xp=torch).view(pairs, batch)
