@@ -143,15 +143,11 @@ class Critic:
         shapes = [(w.shape, b.shape) for layers in (actor, *self.twins) for w, b in layers]
         wanted = [[*sizes, 2 * n_u], *[[sizes[0] + n_u, *sizes[1:], 1]] * 2]
         fit = shapes == [((m, n), (m, 1)) for widths in wanted for n, m in zip(widths, widths[1:])]
-        if not (fit and self.goal_input in ("error", "goal")):
+        if not fit:
             raise ValueError("networks that do not fit")
-        if not all((v > 0).all() for name, v in self.scaling.items() if name.endswith("scale")):
-            raise ValueError("scales that are not positive")
-        weights = [part for layers in (self.actor, *self.twins) for layer in layers for part in layer]
-        mismatch = np.zeros_like(self.plant.START)
-        value = call(export(self)[2], self.plant.START, self.plant.EVAL_GOAL, mismatch)
-        if not all(np.isfinite(np.array(part)).all() for part in [*weights, value]):
-            raise ValueError("weights or values that are not finite")
+        value = call(export(self)[2], self.plant.START, self.plant.EVAL_GOAL, np.zeros_like(self.plant.START))
+        if not np.isfinite(float(value)):
+            raise ValueError("values that are not finite")
 
     def features(self, x, goal):
         """Network input in CasADi: x (n_x,), below it the mismatch if that is observed, goal (n_goal,)."""
@@ -579,7 +575,7 @@ def main(args):
         print("notice: robust MPC is left out; with a single scenario it is nominal MPC", file=sys.stderr)
     if not envs.can_hold(plant, goal):
         print(f"warning: --goal {args.goal} is not a goal that every scenario can hold", file=sys.stderr)
-    out = output_folder(args.out, f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
+    out = output_folder(args.out, Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
     difference = check_export(critic, export(critic)[2])
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}", flush=True)
     tick = time.perf_counter()

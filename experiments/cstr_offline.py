@@ -35,6 +35,8 @@ import cells
 import envs
 import sac_her_branching as sac
 from envs import cstr
+from envs.tools.evaluation import evaluate
+from envs.tools.policy import Scaling
 
 STUDIES = {  # label: arguments of sac_her_branching.py
     "agents": {"robust": {}, "nominal": {"scenarios": "nominal"}},
@@ -47,7 +49,6 @@ STUDIES = {  # label: arguments of sac_her_branching.py
         "9 scenarios, a critic for each": {"scenarios": "mpc"},  # trained by `ScenarioCritics`
     },
 }
-SAC = sac.SAC
 SEPARATE = "9 scenarios, a critic for each"
 COLOURS = {"robust": "#0072B2", "nominal": "#E69F00"}  # Okabe and Ito
 PAPER = {"robust": {"robust": "about 2", "nominal": ""}, "nominal": {"robust": "about 5", "nominal": "about 5"}}
@@ -103,23 +104,22 @@ class ScenarioCritics(sac.SAC):
     The target of scenario i takes its next state, which the plant computes from the stored state and action, and its critics.
     """
 
-    def __init__(self, args, plant, device):
-        super().__init__(args, plant, device)
+    def __init__(self, args, plant):
+        super().__init__(args, plant)
         self.scenarios = plant.SCENARIOS["mpc"]  # (pairs, n_psi)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(args.seed)
-            self.critic, self.target = (ManyCritics(len(self.scenarios), **self.network).to(device) for _ in range(2))
+            self.critic, self.target = (ManyCritics(len(self.scenarios), **self.network) for _ in range(2))
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
-        self.policy.critic = self.critic
         self.optimisers["critic"] = torch.optim.Adam(self.critic.parameters(), lr=args.learning_rate, fused=True)
 
     def update_critic(self, x, u, goal, x_next):
         pairs, batch = len(self.scenarios), len(x)
         with torch.no_grad():
             g = goal.repeat(pairs, 1)  # (pairs * B, n_goal), scenario after scenario, as everything below
-            x_next = self.plant.step(*(v.repeat(pairs, 1).cpu().numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0))
-            x_next = torch.as_tensor(x_next, dtype=torch.float32, device=self.device)
+            x_next = self.plant.step(*(v.repeat(pairs, 1).numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0))
+            x_next = torch.as_tensor(x_next, dtype=torch.float32)
             z = self.features(x_next, g)
             action, log_prob = self.actor.sample(z, self.generator)
             reward = envs.goal_reward(self.plant, x_next[:, self.scaling.goal_index], g, xp=torch).view(pairs, batch)
@@ -139,19 +139,18 @@ class ScenarioCritics(sac.SAC):
 def errors(cell):
     """Trains one agent; a row per evaluation and start state."""
     label, settings, seed, quick = cell
-    agent, starts = (ScenarioCritics if label == SEPARATE else SAC), 20 if quick else 200
-    sac.SAC = agent
+    agent, starts = (ScenarioCritics if label == SEPARATE else sac.SAC), 20 if quick else 200
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = sac.Args(seed=seed, out=Path(folder), eval_every=0, save_every=0, **settings, **({"total_timesteps": 3000} if quick else {}))
         tick = time.perf_counter()
-        data = torch.load(sac.main(args) / "checkpoint.pt", weights_only=True)
+        data = torch.load(sac.main(args, agent) / "checkpoint.pt", weights_only=True)
         seconds = time.perf_counter() - tick
     actor = sac.Actor(**data["network"])
     actor.load_state_dict(data["actor"])
     plant = envs.load("cstr", **data["plant_options"])
-    policy, rows = sac.Policy(plant, actor, None, sac.Scaling(**data["scaling"]), data["goal_input"]), []
+    policy, rows = sac.Policy(plant, actor, None, Scaling(**data["scaling"]), data["goal_input"]), []
     for evaluation in ("nominal", "robust"):
-        ape, held_out = sac.evaluate(policy, cstr.EVAL_GOAL, starts, 0, evaluation == "robust")
+        ape, _, held_out = evaluate(policy, cstr.EVAL_GOAL, starts, evaluation == "robust")
         for start, (error, out) in enumerate(zip(ape, held_out)):
             rows.append({"agent": label, "seed": seed, "evaluation": evaluation, "start": start, "held_out": int(out),
                          "ape": round(float(error), 4), "train_seconds": round(seconds, 1)})  # fmt: skip

@@ -36,6 +36,7 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
 from envs import cstr
+from envs.tools.policy import Scaling
 
 FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0)
 CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)
@@ -123,7 +124,7 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
     Parameters are redrawn at every step, as in training.
     """
     data = torch.load(critic_path, weights_only=True)
-    actor, scaling, a = sac.Actor(**data["network"]), sac.Scaling(**data["scaling"]), data["args"]
+    actor, scaling, a = sac.Actor(**data["network"]), Scaling(**data["scaling"]), data["args"]
     actor.load_state_dict(data["actor"])
     generator = torch.Generator().manual_seed(0)
     x = np.repeat(x, rollouts, axis=0)

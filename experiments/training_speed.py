@@ -36,6 +36,8 @@ import cells
 import envs
 import sac_her_branching as sac
 from envs import cstr
+from envs.tools.evaluation import evaluation_row
+from envs.tools.policy import Scaling
 
 VARIANTS = {  # of the arguments of sac_her_branching.py
     "default": [],
@@ -102,7 +104,7 @@ def peer(cell):
     class Features(BaseFeaturesExtractor):
         def __init__(self, observation_space):
             super().__init__(observation_space, features_dim=len(cstr.X_LOW) + len(cstr.GOAL_INDEX))
-            self.scaling = sac.Scaling.of(cstr)
+            self.scaling = Scaling.of(cstr)
 
         def forward(self, obs):
             return self.scaling.features(obs["observation"], obs["desired_goal"], "error")
@@ -116,7 +118,7 @@ def peer(cell):
         def _on_step(self):
             if self.num_timesteps >= self.due:
                 seconds = time.perf_counter() - self.tick
-                row = sac.evaluation_row(self, 20 if quick else 200, seed)
+                row = evaluation_row(self, 20 if quick else 200)
                 updates = {"step": self.num_timesteps, "updates": self.model._n_updates, "train_seconds": round(seconds, 2)}
                 self.rows.append({"variant": variant, "seed": seed} | updates | row)
                 self.due += every
@@ -149,10 +151,10 @@ def profile(args):
     """Median times of the parts of an update and of a step of the plants, ms."""
     torch.set_num_threads(1)
     settings = sac.Args()
-    agent, rng = sac.SAC(settings, cstr, torch.device("cpu")), np.random.default_rng(0)
+    agent, rng = sac.SAC(settings, cstr), np.random.default_rng(0)
     vec = envs.VectorGoalEnv("cstr", num_envs=settings.num_envs)
     obs, _ = vec.reset(seed=0)
-    buffer = sac.HERBuffer(settings.buffer_size, settings.num_envs, 4, 2, 1, cstr.GOAL_INDEX, 1, "future", settings.her_ratio)
+    buffer = sac.HERBuffer(settings, cstr)
     repeats = 20 if args.quick else 400
 
     def add():

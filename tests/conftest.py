@@ -22,7 +22,7 @@ def plant():
 def checkpoint(tmp_path_factory, plant):
     """An untrained but not trivial checkpoint.pt, written by the training script's own functions."""
     args = training.Args(seed=3)
-    agent = training.SAC(args, plant, torch.device("cpu"))
+    agent = training.SAC(args, plant)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:

@@ -117,7 +117,7 @@ def torch_critic(critic):
 @pytest.fixture(scope="module")
 def pendulum_checkpoint(tmp_path_factory):
     args = training.Args(env="double_pendulum", seed=1, hidden=(32, 32))
-    agent, generator = training.SAC(args, double_pendulum, torch.device("cpu")), torch.Generator().manual_seed(0)
+    agent, generator = training.SAC(args, double_pendulum), torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:
             parameter += 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
@@ -1048,7 +1048,7 @@ def test_foreign_and_damaged_checkpoints_are_refused(checkpoint, tmp_path):
     refused("of another format", data | {"format": "other"})
     refused("trained on 'pendulum'", data | {"env": "pendulum"})
     refused("is not a checkpoint.pt", data | {"network": data["network"] | {"hidden": [32, 32]}})
-    refused("do not fit", data | {"goal_input": "both"})
+    refused("unknown goal_input", data | {"goal_input": "both"})
     refused("not finite", data | {"actor": data["actor"] | {"head.bias": torch.full((4,), torch.nan)}})
     refused("not finite", data | {"critic": {k: v * 1e200 for k, v in data["critic"].items()}})
     refused("not positive", data | {"scaling": data["scaling"] | {"x_scale": [0.0] * 4}})

@@ -339,7 +339,7 @@ def test_a_settled_plant_starts_from_the_last_plan(checkpoint):
 
 def test_default_networks_are_the_papers():
     args = training.Args(env="linear", dim=32)
-    agent = training.SAC(args, envs.load("linear", **args.plant_options), torch.device("cpu"))
+    agent = training.SAC(args, envs.load("linear", **args.plant_options))
     sizes = [sum(p.numel() for p in agent.actor.parameters()), sum(p.numel() for p in agent.critic.parameters()) // 2]
     assert args.hidden == (256, 256) and args.total_timesteps == 500_000
     assert all(90_000 < size < 100_000 for size in sizes)

@@ -91,7 +91,7 @@ def test_code_in_a_checkpoint_is_not_run(capsys, checkpoint, tmp_path):
     torch.save(data, tmp_path / "evil.pt")
     for load in reliability.LOADERS:
         assert reliability.read(load, tmp_path / "evil.pt") == {"refused": 1}
-    with pytest.raises(SystemExit):
+    with pytest.raises(ValueError, match="resume.pt"):
         sac_her_branching.main(sac_her_branching.Args(resume=tmp_path / "evil.pt"))
     assert reliability.Code().__reduce__()[1][0] not in capsys.readouterr().out
 

@@ -5,7 +5,6 @@ import multiprocessing
 import signal
 import tempfile
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -46,6 +45,21 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     return x, u, row
 
 
+def read_trajectories(path, plant):
+    """States (E, T + 1, n_x) and actions (E, T, n_u) of every controller in a trajectories.npz. Raises ValueError."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            x, u = (np.concatenate([data[name] for name in sorted(data.files) if name.endswith(end)]) for end in ("_x", "_u"))
+        if not (x.shape[0], x.shape[1] - 1, *x.shape[2:], u.shape[2]) == (*u.shape[:2], len(plant.X_LOW), len(plant.U_LOW)):
+            raise ValueError
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            raise ValueError
+    except Exception as error:  # missing, truncated, not an archive, of another plant: one sentence for all of them
+        reason = f"not a trajectories.npz of {plant.ENV_ID} ({type(error).__name__})" if path.exists() else "does not exist"
+        raise ValueError(f"{path}: {reason}") from None
+    return x, u
+
+
 def parallel(function, jobs, processes, first=0):
     """[function(*job) for job in jobs] over processes; the `first` ones are done before the others begin."""
     # else CasADi would take Ctrl-C for a failed evaluation, and torch does not survive a fork
@@ -65,14 +79,14 @@ def parallel(function, jobs, processes, first=0):
     return [future.result() for future in futures]
 
 
-def output_folder(out, name):
-    """The folder `out`, or runs/NAME, made and tried. Raises ValueError where it cannot be written."""
+def output_folder(out, otherwise):
+    """The folder `out`, or a new one at the path `otherwise`, made and tried. Raises ValueError where it cannot be written."""
     try:
-        folder = out or envs.new_folder(Path("runs") / name)
+        folder = out or envs.new_folder(otherwise)
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ValueError(f"--out {out or 'runs'}: cannot write there ({error.strerror})") from None
+        raise ValueError(f"--out {out or otherwise.parent}: cannot write there ({error.strerror})") from None
     return folder
 
 
