@@ -31,7 +31,7 @@ def save(data, path):
     os.replace(temporary, path)
 
 
-def read_file(path, wanted, what, device="cpu", most=None, build=lambda data: data):
+def read_file(path, wanted, what, most=None, build=lambda data: data):
     """`build` of the data of a file of the format `wanted`. Raises ValueError for anything else, and for what `build` raises."""
     path = Path(path)
     try:
@@ -39,7 +39,7 @@ def read_file(path, wanted, what, device="cpu", most=None, build=lambda data: da
             raise ValueError(f"larger than {most / 1e9:g} gigabytes")
         if zipfile.ZipFile(path).testzip():
             raise ValueError("damaged")
-        data = torch.load(path, map_location=device, weights_only=True)
+        data = torch.load(path, map_location="cpu", weights_only=True)
         if data["format"] != wanted:
             raise ValueError("of another format")
         return build(data)
