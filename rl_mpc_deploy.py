@@ -36,11 +36,11 @@ import torch
 import tyro
 
 import envs
-from envs.tools.arguments import check_effects, check_ranges
+from envs.tools.arguments import check_effects, check_ranges, check_weights
 from envs.tools.checkpoint import read_checkpoint
 from envs.tools.comparison import draws, output_folder, parallel, run_episode, write_csv
 from envs.tools.compiled import OnArrays, compiled_functions
-from envs.tools.controllers import ActorController, Controller, GreedyController, call
+from envs.tools.controllers import ActorController, Controller, GreedyController, call, checked_problem
 from envs.tools.expansion import check_export, expansion
 from envs.tools.figure import draw_episode
 from envs.tools.model import prediction_model, scaling
@@ -51,11 +51,16 @@ ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "co
 HARD_PRICE = 1e3  # of a hard bound per physical unit: above the multipliers, so that it is an exact penalty
 HARDLY_MOVED = 0.03  # half-widths of the box of initial states
 SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that lowers the cost as promised
-STATIONARY = 1e-4  # share of the cost: a plan whose cost came this close to the predicted one is left as it is
+STATIONARY = (
+    1e-4  # share of the cost: a plan whose cost came this close to the predicted one is left as it is
+)
 Name = Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"]
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC"}
 LABELS |= {"goal_mpc": "RL+MPC, no value", "rl_mpc": "RL+MPC"}
-COLOURS, DASHES = ("#D55E00", "#999999", "#0072B2", "#E69F00", "#009E73"), ("--", ":", "-.", (0, (4, 1, 1, 1)), "-")
+COLOURS, DASHES = (
+    ("#D55E00", "#999999", "#0072B2", "#E69F00", "#009E73"),
+    ("--", ":", "-.", (0, (4, 1, 1, 1)), "-"),
+)
 STYLES = {name: {"color": colour, "ls": dashes} for name, colour, dashes in zip(LABELS, COLOURS, DASHES)}
 
 
@@ -136,7 +141,10 @@ class Critic:
         actor, critic = ({k: v.double().numpy() for k, v in data[net].items()} for net in ("actor", "critic"))
         names = [*(f"layers.{i}" for i in range(len(sizes) - 1)), "head"]
         actor = [(actor[f"{name}.weight"], actor[f"{name}.bias"][:, None]) for name in names]
-        self.actor = [*actor[:-1], tuple(part[:n_u] for part in actor[-1])]  # the rest is a standard deviation
+        self.actor = [
+            *actor[:-1],
+            tuple(part[:n_u] for part in actor[-1]),
+        ]  # the rest is a standard deviation
         pairs = [(critic[f"weight.{i}"], critic[f"bias.{i}"]) for i in range(len(sizes))]
         self.twins = [[(w[j].T, b[j].T) for w, b in pairs] for j in range(2)]
         # what torch would refuse, and what is no use
@@ -222,26 +230,35 @@ class ScenarioMPC(Controller):
     """
 
     def __init__(
-        self, plant, horizon, scenarios, stage_cost, value=None, *, goal, robust_horizon=1, slack_price=1.0,
-        change_weight=0.0, policy=None, expansion=None, estimator=None, iterations=5, deadline_ms=None, compile=True,
-    ):  # fmt: skip
+        self,
+        plant,
+        horizon,
+        scenarios,
+        stage_cost,
+        value=None,
+        *,
+        goal,
+        robust_horizon=1,
+        slack_price=1.0,
+        change_weight=0.0,
+        policy=None,
+        expansion=None,
+        estimator=None,
+        iterations=5,
+        deadline_ms=None,
+        compile=True,
+    ):
         if not (isinstance(iterations, (int, np.integer)) and iterations >= 0):
             raise ValueError(f"iterations is {iterations!r}; it must be a whole number of at least 0")
         if not (deadline_ms is None or isinstance(deadline_ms, (int, float, np.number)) and deadline_ms > 0):
             raise ValueError(f"deadline_ms is {deadline_ms!r}; it must be a positive number, or None")
         self.iterations, self.deadline_ms = iterations, deadline_ms
-        scenarios, n_psi = np.array(scenarios, dtype=float), len(plant.PSI_NOMINAL)
-        if scenarios.shape[1:] != (n_psi,) or not len(scenarios) or not np.isfinite(scenarios).all():
-            raise ValueError(f"scenarios have shape {scenarios.shape}; they must be finite, (S, {n_psi})")
+        scenarios, price, change_weight = checked_problem(plant, scenarios, slack_price, change_weight)
         self.scenarios = scenarios if robust_horizon else scenarios[:1]
         self.horizon, self.tree = horizon, ScenarioTree(len(self.scenarios), horizon, robust_horizon)
         self.x_center, self.x_scale, self.u_center, self.u_scale = scaling(plant)
         self.policy = policy
         # prices per scaled unit; states without a bound or a price are left out
-        price, change_weight = np.array(slack_price, dtype=float), np.array(change_weight, dtype=float)
-        if not ((price >= 0).all() and (change_weight >= 0).all() and np.isfinite(change_weight).all()):  # nor nan
-            weights = f"slack_price is {price.tolist()}, change_weight {change_weight.tolist()}"
-            raise ValueError(f"{weights}; they must not be negative, the second finite")
         bounds = (np.array([plant.X_LOW, plant.X_HIGH]) - self.x_center) / self.x_scale
         active = np.isfinite(bounds) & (price > 0)
         self.rows = np.flatnonzero(active.any(axis=0))
@@ -333,8 +350,8 @@ class ScenarioMPC(Controller):
         rolled_out(step, follow)
         return [rollout, linearise, ca.Function("follow", problem, [ca.horzcat(*actions)])]
 
-    def reset(self):
-        super().reset()
+    def reset(self, u=None):
+        super().reset(u)
         self.plan = self.problem = None  # scaled actions (inner, n_u), and what they were planned from
 
     def belief(self, x):
@@ -345,9 +362,8 @@ class ScenarioMPC(Controller):
     def _problem(self, x):
         """Parameters of the compiled functions, a row per column of theirs."""
         starts, psi, weight = self.belief(x)
-        goal = self.goal.reshape(len(self.goal), -1).T
         u_before = (self.u_before - self.u_center) / self.u_scale
-        known = (starts - self.x_center) / self.x_scale, psi, self.tree.weights(weight)[:, None], goal
+        known = (starts - self.x_center) / self.x_scale, psi, self.tree.weights(weight)[:, None], self.goals.T
         known += self.estimator.disturbance, self.estimator.mismatch
         return *known, self.slack_price, self.change_weight, u_before
 
@@ -409,8 +425,11 @@ class ScenarioMPC(Controller):
         costs = {name: cost for name, u in guesses.items() if np.isfinite(cost := self._cost(u))}
         if not costs:
             self.plan, self.stats["fell_back"] = None, True
-            goal = self.goal.reshape(len(self.goal), -1)[:, 0]
-            u = call(self.policy, x, goal, self.estimator.mismatch) if self.policy is not None else np.nan
+            u = (
+                call(self.policy, x, self.goals[:, 0], self.estimator.mismatch)
+                if self.policy is not None
+                else np.nan
+            )
             return np.array(u).ravel()
         best = min(costs, key=costs.get)
         self.stats |= dict(rung="plan", guess=best, guess_cost=costs[best], stop="limit", predicted=0.0)
@@ -423,9 +442,7 @@ class ScenarioMPC(Controller):
             raise ValueError("there is no prediction before the first make_step, nor where it fell back")
         states = self.rollout(*self.problem, self.plan)[1] * self.x_scale + self.x_center
         actions = self.plan * self.u_scale + self.u_center
-        first = self.tree.first[1:-1]
-        x, u = np.split(states, first[1:] - 1), np.split(actions, first[:-1])
-        return {"x": [part.T for part in x], "u": [part.T for part in u]}
+        return self.tree.by_stage(states, actions)
 
 
 def build_controller(name, args):
@@ -444,7 +461,7 @@ def build_controller(name, args):
     if name == "rl_mpc" and args.horizon == 0:
         return GreedyController(plant, mu, Q, goal, estimator(observed))
     spread = (0.5 if args.offset_free else 1.0) if args.spread is None else args.spread
-    scenarios = plant.PSI_NOMINAL + spread * (plant.SCENARIOS["mpc"] - plant.PSI_NOMINAL)
+    scenarios = plant.PSI_NOMINAL + spread * (envs.scenario_set(plant, "mpc") - plant.PSI_NOMINAL)
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
     squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
     kind = args.estimate if args.offset_free else observed
@@ -556,13 +573,11 @@ def check(args):
         raise ValueError("--horizon is 0; --controllers goal_mpc plans, so that it must be at least 1")
     if not args.controllers:
         raise ValueError(f"--controllers is empty; choose from {', '.join(LABELS)}")
-    changes = args.change_weight or [0.0] * len(plant.U_LOW)
-    if len(changes) != len(plant.U_LOW) or not all(0 <= price < np.inf for price in changes):
-        raise ValueError(f"--change-weight is {changes}; it needs {len(plant.U_LOW)} numbers of at least 0")
+    check_weights("change_weight", args.change_weight, len(plant.U_LOW))
     uncertain = np.ptp(plant.SCENARIOS["mpc"], axis=0).any()
     if args.offset_free and args.estimate == "parameters" and not uncertain:
         raise ValueError(f"--estimate is parameters, but {args.env} has none that are uncertain")
-    ScenarioTree(len(plant.SCENARIOS["mpc"]), max(args.horizon, 1), args.robust_horizon)
+    ScenarioTree(len(envs.scenario_set(plant, "mpc")), max(args.horizon, 1), args.robust_horizon)
     goal = envs.checked_goal(plant, plant.EVAL_GOAL if args.goal is None else args.goal)
     return plant, goal, critic
 
@@ -570,12 +585,14 @@ def check(args):
 def main(args):
     plant, goal, critic = check(args)
     names = list(dict.fromkeys(args.controllers))
-    if len(plant.SCENARIOS["mpc"]) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):
+    if len(envs.scenario_set(plant, "mpc")) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):
         names.remove("robust_mpc")
         print("notice: robust MPC is left out; with a single scenario it is nominal MPC", file=sys.stderr)
     if not envs.can_hold(plant, goal):
         print(f"warning: --goal {args.goal} is not a goal that every scenario can hold", file=sys.stderr)
-    out = output_folder(args.out, Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}")
+    out = output_folder(
+        args.out, Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}"
+    )
     difference = check_export(critic, export(critic)[2])
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}", flush=True)
     tick = time.perf_counter()
@@ -592,7 +609,9 @@ def main(args):
     draw_episode(plant, lines, np.tile(goal, (args.steps, 1)), out / "episode.png")
     print(table(rows))
     seconds = time.perf_counter() - tick
-    print(f"{args.episodes} paired draws in {seconds:.0f} s; {out}/results.csv, trajectories.npz and episode.png,")
+    print(
+        f"{args.episodes} paired draws in {seconds:.0f} s; {out}/results.csv, trajectories.npz and episode.png,"
+    )
     print("which starts from the plant's own start state and has nominal parameters")
     return rows
 

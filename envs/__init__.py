@@ -185,6 +185,17 @@ def load(name, observe_mismatch=False, **options):
     return Mismatch(plant, None if observe_mismatch is True else observe_mismatch) if observe_mismatch else plant
 
 
+def scenario_set(plant, name):
+    """Parameters (S, n_psi) of the plant's scenario set, the nominal ones first, whether the set has them or not.
+
+    Raises ValueError for a set that the plant does not have.
+    """
+    if name not in plant.SCENARIOS:
+        raise ValueError(f"--scenarios {name} is not a scenario set of {plant.ENV_ID}; choose one of {', '.join(plant.SCENARIOS)}")
+    scenarios = np.asarray(plant.SCENARIOS[name])
+    return np.concatenate([plant.PSI_NOMINAL[None], scenarios[(scenarios != plant.PSI_NOMINAL).any(axis=1)]])
+
+
 def sample_states(plant, rng, n):
     """Initial states uniform in their box, (n, n_x)."""
     if isinstance(plant, Mismatch):  # zero at first, and no random numbers of its own

@@ -85,23 +85,23 @@ class Oracle(literal.IpoptMPC):
         stage = literal.gaussian(known_plant(), METRIC_SIGMA2)
         super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, slack_price=price, compile=compile)
 
-    def _build_problem(self):
+    def build_problem(self, *costs):
         """The price of slack is a parameter: a problem serves every weight."""
-        super()._build_problem()
-        weight, at = ca.MX.sym("weight"), self.positions("slack")  # (bounds, steps)
-        slack = ca.reshape(self.nlp["x"][at.ravel("F").tolist()], *at.shape)
-        cost = ca.sum2(ca.DM(self.x_scale[np.concatenate(self.soft)]).T @ slack)
-        self.nlp |= {"f": self.nlp["f"] + (weight - 1) * cost, "p": ca.vertcat(self.nlp["p"], weight)}
+        problem, limits = super().build_problem(*costs)
+        weight, at = ca.MX.sym("weight"), self.at["slack"]  # (bounds, steps)
+        slack = ca.reshape(problem["x"][at.ravel("F").tolist()], *at.shape)
+        cost = ca.sum2(ca.DM(self.x_scale[np.concatenate(self.priced)]).T @ slack)
+        return problem | {"f": problem["f"] + (weight - 1) * cost, "p": ca.vertcat(problem["p"], weight)}, limits
 
-    def solve(self, x0, psi, weight, guess):
+    def optimum(self, x0, psi, weight, guess):
         """Actions (steps, n_u) that one solve from the actions `guess`, or from the held state (None), ends with; None if it fails."""
         start, solver = np.append(x0, psi), self.solvers["cold"]
-        w = self.hold_guess(start) if guess is None else self.tree_guess(start, lambda t, x: guess[t])
-        result = solver(x0=w, p=np.concatenate([start, self.u_before, self.goal.ravel("F"), [weight]]), **self.bounds)
-        self.last_objective, found = float(result["f"]), np.array(result["x"]).ravel()
-        if not solver.stats()["success"] or not np.isfinite(self.last_objective):
+        w = self.held(start) if guess is None else self.tree_guess(start, lambda t, x: guess[t])
+        result = solver(x0=w, p=np.concatenate([start, self.u_before, self.goals.ravel("F"), [weight]]), **self.limits)
+        self.objective = float(result["f"])
+        if not solver.stats()["success"] or not np.isfinite(self.objective):
             return None
-        return np.array([self.physical(found, "u", t)[:, 0] for t in range(self.horizon)])
+        return self.planned(np.array(result["x"]).ravel())[1]
 
 
 @functools.cache
@@ -127,7 +127,7 @@ def best(cell):
 
     def improve(weight, guesses):
         for label, guess in guesses.items():
-            u = oracle(steps).solve(x0, psi, weight, guess)
+            u = oracle(steps).optimum(x0, psi, weight, guess)
             rows.setdefault(weight, []).append(None)
             if u is not None:
                 near, outside, slack = measure(x0, psi, u)

@@ -56,13 +56,14 @@ class Args:
 
 
 class GaussNewton(literal.IpoptMPC):
-    def _build_solvers(self, *arguments):
-        super()._build_solvers(*arguments)
-        w, p, f, g = (self.nlp[name] for name in "xpfg")
+    def build_solvers(self, compile, options):
+        oracle = super().build_solvers(compile, options)["cold"].oracle()
+        w, p, f, g = (self.problem[name] for name in "xpfg")
         factor, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
         hessian = ca.Function("nlp_hess_l", [w, p, factor, multipliers], [ca.triu(ca.hessian(factor * f, w)[0])])
-        oracle = self.solvers["cold"].oracle()
-        self.solvers = {name: ca.nlpsol(name, "ipopt", oracle, given | {"hess_lag": hessian}) for name, given in self.options.items()}
+        common = {"print_time": False, "show_eval_warnings": False, "hess_lag": hessian}
+        ipopt = {"cold": self.cold | options, "warm": self.cold | options | self.warm}
+        return {name: ca.nlpsol(name, "ipopt", oracle, common | {"ipopt": given}) for name, given in ipopt.items()}
 
 
 class Second:
@@ -72,9 +73,9 @@ class Second:
         self.other = other
         super().__init__(*arguments, **options)
 
-    def reset(self):
-        super().reset()
-        self.other.reset()
+    def reset(self, u=None):
+        super().reset(u)
+        self.other.reset(u)
 
     def actions(self, x):
         """The other's plan, a list over stages (n_u, nodes)."""
@@ -87,9 +88,9 @@ class IpoptSecond(Second, literal.IpoptMPC):
     def make_step(self, x0):
         actions = self.actions(x0)
         w = self.tree_guess(x0, lambda t, x: actions[t])
-        guess_cost, self.solution, self.plan = self.cost(x0, w), None, (w, np.zeros(self.size["w"]), np.zeros(self.size["g"]))
+        guess_cost, self.found, self.plan = self.cost(x0, w), None, (w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"])))
         u = super().make_step(x0)
-        self.stats |= {"guess_cost": guess_cost, "cost": guess_cost if self.stats["fell_back"] else self.last_objective}
+        self.stats |= {"guess_cost": guess_cost, "cost": guess_cost if self.stats["fell_back"] else self.objective}
         return u
 
 

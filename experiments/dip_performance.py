@@ -8,7 +8,7 @@ N = 75. Writes results/dip_performance.csv (a row per controller and start, colu
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
@@ -52,13 +52,27 @@ class Args:
     """folder whose results/ and figures/ are written"""
 
 
-def run_cell(settings):
+class Guided(gm.ScenarioMPC):
+    """An episode starts from the simulated closed loop of another controller, of a shorter horizon."""
+
+    guide = None
+
+    def first_guesses(self, x0):
+        if self.guide is not None and self.plan is None:
+            self.guide.reset(self.u_before)
+            yield self.rolled_out(x0, lambda t, x: self.guide.make_step(x))
+        yield from super().first_guesses(x0)
+
+
+def run_cell(cell):
     """One controller from every start; rows of results.csv with the guide's horizon."""
-    mpc, goals, rows = gm.build_controller(settings), np.zeros((settings.steps, 2)), []
+    settings, guide_horizon = cell
+    mpc, goals, rows = gm.build_controller(settings, Guided), np.zeros((settings.steps, 2)), []
+    mpc.guide = gm.build_controller(replace(settings, horizon=guide_horizon)) if guide_horizon else None
     for seed in range(settings.seed, settings.seed + settings.episodes):
         x0, psi = gm.start_and_plant(double_pendulum, seed, random_plant=False)
         x, u, _, log = gm.simulate(mpc, x0, psi, goals)
-        head = {"env": settings.env, "objective": settings.objective, "horizon": settings.horizon, "guide_horizon": settings.guide_horizon}
+        head = {"env": settings.env, "objective": settings.objective, "horizon": settings.horizon, "guide_horizon": guide_horizon}
         rows.append(head | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)} | gm.summary(double_pendulum, x, u, goals, log))
     return rows
 
@@ -66,10 +80,10 @@ def run_cell(settings):
 def collect(args):
     work = []
     for objective, horizon, guide in CELLS:
-        settings = gm.Args(objective=objective, horizon=horizon, guide_horizon=guide, episodes=args.episodes, seed=args.seed)
+        settings = gm.Args(objective=objective, horizon=horizon, episodes=args.episodes, seed=args.seed)
         if args.quick:
-            settings = gm.replace(settings, horizon=horizon // 25, guide_horizon=guide // 25, episodes=2, steps=5, compile=False)
-        work.append(settings)
+            settings, guide = replace(settings, horizon=horizon // 25, episodes=2, steps=5, compile=False), guide // 25
+        work.append((settings, guide))
     inputs = [__file__, gm.__file__, gm.envs.__file__, double_pendulum.__file__]
     cells.write(cells.collect(run_cell, work, args.jobs, args.runs, inputs), args.out / "results/dip_performance.csv")
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import casadi as ca
 import matplotlib
 import numpy as np
 import tyro
@@ -109,14 +110,45 @@ def make_plant(n, system, settings):
     return plant
 
 
+class LinearMPC(gm.ScenarioMPC):
+    """goal_mpc.py's controller whose stage t, slack included, counts gamma^t, with the discounted regulator's value at its end.
+
+    control_horizon: N_c of eq:nominalMPCobj, from which stage on the actions follow that regulator; None: never.
+    """
+
+    def __init__(self, plant, horizon, objective="quadratic", *, gamma=1.0, control_horizon=None, **options):
+        self.gamma, self.control_horizon = gamma, control_horizon
+        x, goal = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
+        value = plant.lq_value(x, goal, gamma)
+        terminal = ca.Function("terminal", [x, goal], [-ca.exp(-value) if objective == "goal" else value], {"never_inline": True})
+        options = dict(goal=plant.EVAL_GOAL, compile=False) | options
+        super().__init__(plant, horizon, plant.SCENARIOS["nominal"], gm.costs(plant, objective)[0], terminal, **options)
+
+    def weights(self):
+        return super().weights() * self.gamma**self.tree.stage
+
+    def build_problem(self, *costs):
+        problem, limits = super().build_problem(*costs)
+        if self.control_horizon is not None:
+            n, N = self.plant.A.shape[0], self.horizon
+            x, u = (ca.reshape(problem["x"][at.ravel("F").tolist()], n, N) for at in (self.at["x"], self.at["u"]))
+            x = ca.horzcat(problem["p"][:n], x * self.x_scale + self.x_center)
+            goal = ca.reshape(problem["p"][2 * n :], n, N)
+            law = [self.plant.feedback(x[:, t], goal[:, t], self.gamma) for t in range(self.control_horizon, N)]
+            follows = ca.veccat(*(u[:, N - len(law) + i] - (action - self.u_center) / self.u_scale for i, action in enumerate(law)))
+            problem["g"] = ca.vertcat(problem["g"], follows)
+            limits |= {name: np.append(limits[name], np.zeros(follows.numel())) for name in ("lbg", "ubg")}
+        return problem, limits
+
+    def build_shift(self):
+        w, known = super().build_shift()[0], self.at["x"].size + self.at["slack"].size
+        return w, w, np.append(w[:known], np.arange(known, len(self.limits["lbg"])))  # the law's multipliers stay where they are
+
+
 def controller(plant, objective, settings):
     """One of the two controllers for this plant."""
-    gamma, law = settings["gamma"], None
-    if settings["control_horizon"] is not None:
-        law = gm.feedback_law(plant, gamma)
-    return gm.ScenarioMPC(plant, settings["horizon"], plant.SCENARIOS["nominal"], *gm.costs(plant, objective, None, gamma),
-                          goal=plant.EVAL_GOAL, slack_price=settings["price"], gamma=gamma, law=law,
-                          control_horizon=settings["control_horizon"], compile=False)  # fmt: skip
+    named = {name: settings[name] for name in ("gamma", "control_horizon")}
+    return LinearMPC(plant, settings["horizon"], objective, slack_price=settings["price"], **named)
 
 
 def plan_sides(mpc, x0):

@@ -189,7 +189,7 @@ def build(label, dim, system, horizon, critic, compile=True):
     if label == "RL+MPC, taylor":
         value, policy = taylor_value(critic), deploy.export(critic)[0]
     else:  # far from the goal the stage cost is flat: from middle actions no solver would find the way
-        value, policy = None, gm.feedback_law(plant)
+        value, policy = None, ca.Function("regulator", [x, goal], [plant.feedback(x, goal)])
     return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], stage, value, goal=plant.EVAL_GOAL, policy=policy, compile=compile)
 
 

@@ -4,7 +4,6 @@ rl_mpc_deploy.py's controllers solve the same problems by an iteration of their 
 """
 
 import sys
-import time
 from pathlib import Path
 
 import casadi as ca
@@ -20,95 +19,93 @@ AT_REST = 1e-3  # movement of a state, half-widths of the box
 
 
 class IpoptMPC(gm.ScenarioMPC):
-    """goal_mpc.py's controller in the closed loops of rl_mpc_deploy.py: the statistics and the first guesses are those of its controllers.
+    """goal_mpc.py's controller in the closed loops of rl_mpc_deploy.py: the first guesses are those of its controllers.
 
     policy: CasADi function (x, goal) -> u (n_u,), or None. Its rollout through the tree is a first guess, and it acts where no solve
     succeeds. Guesses are chosen as by rl_mpc_deploy.py's planner, but that at rest the last solution is taken without a comparison.
     barrier: IPOPT's at the start of a warm solve, or "adaptive" (mu_strategy, of every solve).
     """
 
-    def __init__(self, *arguments, policy=None, barrier=1e-4, max_iter=200, **options):
-        self.policy, self.barrier = policy, barrier
-        super().__init__(*arguments, max_iter=max_iter, **options)
-        self.model = self._model()
-        self.objective = ca.Function("objective", [self.nlp["x"], self.nlp["p"]], [self.nlp["f"]])
+    # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost.
+    # Variables are scaled already: MUMPS need not, nor refine every solution (a tenth of the time)
+    cold = gm.ScenarioMPC.cold | {"max_iter": 200, "mumps_permuting_scaling": 0, "mumps_scaling": 0, "min_refinement_steps": 0}
 
-    def _build_solvers(self, compile, tol, max_iter):
-        super()._build_solvers(compile, tol, max_iter)
-        # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost
-        cold = {"print_level": 0, "sb": "yes", "tol": tol, "max_iter": max_iter, "bound_relax_factor": 0.0}
-        # variables are scaled already: MUMPS need not, nor refine every solution (a tenth of the time)
-        cold |= {"mumps_permuting_scaling": 0, "mumps_scaling": 0, "min_refinement_steps": 0}
-        cold |= {"mu_strategy": "adaptive"} if self.barrier == "adaptive" else {}
-        warm = cold | {"warm_start_init_point": "yes"} | ({} if self.barrier == "adaptive" else {"mu_init": self.barrier})
-        for name in ("bound_push", "mult_bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"):
-            warm[f"warm_start_{name}"] = 1e-6
-        common, oracle = {"print_time": False, "show_eval_warnings": False}, self.solvers["cold"].oracle()
-        self.options = {name: common | {"ipopt": ipopt} for name, ipopt in (("cold", cold), ("warm", warm))}
-        self.solvers = {name: ca.nlpsol(name, "ipopt", oracle, options) for name, options in self.options.items()}
+    def __init__(self, *arguments, policy=None, barrier=1e-4, **options):
+        self.policy = policy
+        if barrier == "adaptive":
+            self.cold = self.cold | {"mu_strategy": "adaptive"}
+            self.warm = {name: value for name, value in self.warm.items() if name != "mu_init"}
+        else:
+            self.warm = self.warm | {"mu_init": barrier}
+        super().__init__(*arguments, **options)
+        self.predict = self.model()
+        self.cost_of = ca.Function("cost", [self.problem["x"], self.problem["p"]], [self.problem["f"]])
 
     def tree_guess(self, x0, action):
         """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
-        w, x, S = self.hold_guess(np.asarray(x0)), np.asarray(x0, dtype=float)[:, None], len(self.scenarios)
-        for t, (n, n_next) in enumerate(zip(self.nodes, self.nodes[1:])):
-            u = np.clip(np.array(action(t, x)).reshape(self.n_u, -1), self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None])
-            parent = np.arange(n_next) // (n_next // n)
-            x = np.array(self.model(x[:, parent], u[:, parent], self.scenarios[np.arange(n_next) % S].T))
-            w[self.index["u"][t]] = (u - self.u_center[:, None]) / self.u_scale[:, None]
-            w[self.index["x"][t + 1]] = (x - self.x_center[:, None]) / self.x_scale[:, None]
-            violation = self.plant.X_LOW[:, None] - x, x - self.plant.X_HIGH[:, None]
-            slack = [np.maximum(v / self.x_scale[:, None], 0)[rows] for v, rows in zip(violation, self.soft)]
-            w[self.index["slack"][t + 1]] = np.concatenate(slack)
-        return w
+        tree, x, states, actions = self.tree, (x0 - self.x_center)[:, None] / self.x_scale[:, None], [], []
+        for t in range(self.horizon):
+            u = np.array(action(t, x * self.x_scale[:, None] + self.x_center[:, None])).reshape(len(self.u_scale), -1)
+            actions.append(np.clip(u, self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None]))
+            here = slice(tree.first[t + 1], tree.first[t + 2])
+            parent, psi = tree.parent[here] - tree.first[t], self.scenarios[tree.scenario[here]].T
+            scaled = (actions[-1] - self.u_center[:, None]) / self.u_scale[:, None]
+            x = np.array(self.predict(x[:, parent], scaled[:, parent], psi))
+            states.append(x)
+        return self.vector(np.hstack(states).T * self.x_scale + self.x_center, np.hstack(actions).T)
 
     def policy_guess(self, x0):
-        return self.tree_guess(x0, lambda t, x: self.policy(x, self.goal[:, t]))
+        return self.tree_guess(x0, lambda t, x: self.policy(x, self.goals[:, t]))
 
-    def cold_guesses(self):
-        return super().cold_guesses() if self.policy is None else (self.policy_guess, self.hold_guess)
+    def first_guesses(self, x0):
+        if self.policy is None:
+            yield from super().first_guesses(x0)
+        else:
+            yield self.policy_guess(x0)
+            yield self.held(x0)
 
     def cost(self, x0, w):
         """Objective of a plan that `tree_guess` gave."""
-        return float(self.objective(w, np.concatenate([x0, self.u_before, self.goal.ravel("F")])))
+        return float(self.cost_of(w, np.concatenate([x0, self.u_before, self.goals.ravel("F")])))
 
-    def reset(self):
-        super().reset()
-        self.solution = None  # of the last step, not shifted
-        self.x_before = self.x_compared = None  # the last state, and that at which guesses were last compared
+    def reset(self, u=None):
+        super().reset(u)
+        self.found = None  # what the last solve gave, not shifted
+        self.x_compared = None  # the state at which guesses were last compared
 
-    def _solve(self, *arguments):
-        self.solution = super()._solve(*arguments)
-        return self.solution
+    def solve(self, *arguments):
+        self.found = super().solve(*arguments)
+        return self.found
 
     def choose_guess(self, x0):
         """Put the cheapest first guess in the place of the shifted plan."""
-        if self.solution is not None and np.abs((x0 - self.x_compared) / self.x_scale).max() < AT_REST:
-            self.plan = self.solution
+        if self.found is not None and np.abs((x0 - self.x_compared) / self.x_scale).max() < AT_REST:
+            self.plan = self.found
             return
         self.x_compared, plans = x0, [self.plan]
-        if self.policy is not None and self.solution is not None:
+        if self.policy is not None and self.found is not None:
             # where things move, an action that is planned for later would be put off for ever
             if np.abs((x0 - self.x_before) / self.x_scale).max() < deploy.HARDLY_MOVED:
-                plans.append(self.solution)
-        plans = [(self.tree_guess(x0, lambda t, x, w=w: self.physical(w, "u", t)), *multipliers) for w, *multipliers in plans]
-        costs = [self.cost(x0, w) for w, *_ in plans]
-        self.plan = plans[np.argmin(costs)]
+                plans.append(self.found)
+        rolled_out = []
+        for w, *multipliers in plans:
+            actions = np.split(self.planned(w)[1], self.tree.first[1:-2])
+            rolled_out.append((self.tree_guess(x0, lambda t, x, actions=actions: actions[t].T), *multipliers))
+        costs = [self.cost(x0, w) for w, *_ in rolled_out]
+        self.plan = rolled_out[np.argmin(costs)]
         if self.policy is not None and not min(costs) <= self.cost(x0, self.policy_guess(x0)):
-            self.set_initial_guess(x0)
+            self.plan = None
 
-    def make_step(self, x0):
-        tick = time.perf_counter()
+    def action(self, x, tick):
         if self.plan is not None:
-            self.choose_guess(x0)
+            self.choose_guess(x)
         else:
-            self.x_compared = x0
-        super().make_step(x0)
-        self.x_before, fell_back = x0, self.stats["rung"] in ("plan", "hold")
-        if self.stats["rung"] == "hold" and self.policy is not None:
-            self.stats["rung"] = "actor"
-            self.u_before = np.clip(np.array(self.policy(x0, self.goal[:, 0])).ravel(), self.plant.U_LOW, self.plant.U_HIGH)
-        self.stats |= {"fell_back": fell_back, "late": False, "wall_ms": 1e3 * (time.perf_counter() - tick)}
-        return self.u_before.copy()
+            self.x_compared = x
+        u = super().action(x, tick)
+        if self.policy is not None and not np.isfinite(u).all():
+            self.stats |= {"rung": "actor", "fell_back": True}
+            u = np.array(self.policy(x, self.goals[:, 0])).ravel()
+        return u
 
 
 class RelaxedMPC(IpoptMPC):
@@ -122,39 +119,34 @@ class RelaxedMPC(IpoptMPC):
         self.relaxed = IpoptMPC(*arguments, slack_price=RELAXED_PRICE, **options) if hard else None
         super().__init__(*arguments, slack_price=slack_price, **options)
 
-    def reset(self):
-        super().reset()
+    def reset(self, u=None):
+        super().reset(u)
         self.infeasible = False
         if self.relaxed is not None:
-            self.relaxed.reset()
+            self.relaxed.reset(u)
 
-    def _solve(self, *arguments):
+    def solve(self, *arguments):
         relaxed = self.relaxed is not None and self.stats["rung"] == "retry"  # a second try is the other problem's
-        return None if relaxed else super()._solve(*arguments)
+        return None if relaxed else super().solve(*arguments)
 
-    def make_step(self, x0):
-        tick, u_before, other, spent = time.perf_counter(), self.u_before, self.relaxed, 0
+    def action(self, x, tick):
+        other, spent = self.relaxed, 0
         if not self.infeasible:
-            u = super().make_step(x0)
+            u = super().action(x, tick)
             if other is None or self.stats["success"]:
                 return u
-            spent = self.stats["iterations"]
-            other.set_initial_guess(x0)
-        other.u_before = u_before
+            spent, other.plan = self.stats["iterations"], None
+        other.u_before = self.u_before
         other.set_goal(self.goal)
-        self.u_before = other.make_step(x0)
-        self.stats = other.stats | {"success": False, "iterations": spent + other.stats["iterations"]}
-        self.infeasible, self.plan, self.plan_left = True, None, 0
+        u = other.make_step(x)
+        self.stats |= other.stats | {"success": False, "iterations": spent + other.stats["iterations"]}
+        self.infeasible, self.plan = True, None
         if not self.stats["fell_back"]:
-            slack = other.last_w[other.positions("slack")].max(axis=1)
-            hard = np.isinf(np.concatenate([price[rows] for price, rows in zip(self.slack_price, other.soft)]))
-            self.infeasible = slack[hard].max() > FEASIBLE
-            w = np.zeros(self.size["w"])
-            for name in ("x", "u"):
-                w[self.positions(name)] = other.plan[0][other.positions(name)]
-            self.plan = w, np.zeros(self.size["w"]), np.zeros(self.size["g"])
-        self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
-        return self.u_before.copy()
+            hard = np.isinf(np.concatenate([price[rows] for price, rows in zip(self.slack_price, other.priced)]))
+            self.infeasible = other.solution[other.at["slack"]].max(axis=1)[hard].max() > FEASIBLE
+            w = self.vector(*other.planned(other.plan[0]))
+            self.plan = w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"]))
+        return u
 
 
 class PrintedMPC(IpoptMPC):
@@ -165,9 +157,10 @@ class PrintedMPC(IpoptMPC):
         stage = ca.Function("stage", [x, u, goal], [stage_cost(x, goal)], {"never_inline": True})  # of a state and its action: before x_N
         super().__init__(plant, horizon, scenarios, stage, terminal_cost, **options)
 
-    def _build_problem(self):
-        super()._build_problem()
-        self.bounds["lbg"][self.index["box"][self.horizon]] = -np.inf
+    def build_problem(self, *costs):
+        problem, limits = super().build_problem(*costs)
+        limits["lbg"][self.at["slack"][:, self.tree.first[self.horizon] - 1 :]] = -np.inf
+        return problem, limits
 
 
 class LiteralMPC(PrintedMPC):

@@ -49,6 +49,10 @@ from envs.tools.checkpoint import MAX_CHECKPOINT_BYTES
 from envs.tools.expansion import torch_value
 
 EPISODE = 25  # steps
+IPOPT = {  # goal_mpc.py's
+    "goal_mpc.py, reactor": gm.Args(env="cstr", horizon=10, robust_horizon=1),
+    "goal_mpc.py, pendulum": gm.Args(horizon=20),
+}
 CONTROLLERS = {
     "RL+MPC, N = 5": lambda: deploy.build_controller("rl_mpc", deploy.Args()),
     "RL+MPC, offset-free": lambda: deploy.build_controller("rl_mpc", deploy.Args(offset_free=True)),
@@ -57,11 +61,8 @@ CONTROLLERS = {
     "actor": lambda: deploy.build_controller("actor", deploy.Args()),
     "nominal MPC": lambda: deploy.build_controller("nominal_mpc", deploy.Args()),
     "robust MPC": lambda: deploy.build_controller("robust_mpc", deploy.Args()),
-    "goal_mpc.py, reactor": lambda: gm.build_controller(gm.Args(env="cstr", horizon=10, robust_horizon=1)),
-    "goal_mpc.py, pendulum": lambda: gm.build_controller(gm.Args(horizon=20)),
-}
+} | {name: lambda settings=settings: gm.build_controller(settings) for name, settings in IPOPT.items()}
 PLANS = [name for name in CONTROLLERS if name not in ("actor", "RL+MPC, N = 0")]  # have a solver and a plan
-IPOPT = [name for name in PLANS if name.startswith("goal_mpc.py")]
 ANYTIME = [name for name in PLANS if name not in IPOPT]
 FAULTS = {  # case: controllers that it can befall
     "random": list(CONTROLLERS),
@@ -100,19 +101,19 @@ class Args:
 # Closed loops
 
 
-def stopped_early(controller):
-    """goal_mpc.py's solvers, stopped after three iterations."""
-    usual = controller.solvers
-    controller._build_solvers(controller.compiled, tol=1e-6, max_iter=3)
-    early, controller.solvers = controller.solvers, usual
-    return early
+class Hasty(gm.ScenarioMPC):
+    """Its solvers stop after three iterations."""
+
+    cold = gm.ScenarioMPC.cold | {"max_iter": 3}
 
 
 @cache
 def built(name):
+    """A controller, and of goal_mpc.py's the solvers that stop early."""
     torch.set_num_threads(1)
-    controller = CONTROLLERS[name]()
-    return controller, stopped_early(controller) if name in IPOPT else None
+    if name in IPOPT:
+        return gm.build_controller(IPOPT[name]), gm.build_controller(IPOPT[name], Hasty).solvers
+    return CONTROLLERS[name](), None
 
 
 def draw(plant, rng):
@@ -123,10 +124,8 @@ def draw(plant, rng):
 
 
 def out_of_reach(controller, goal, rng):
-    """A goal that not every scenario can hold; goal_mpc.py, which takes any that is finite, gets one 2 to 10 ranges away."""
+    """A goal that not every scenario can hold."""
     low, high = controller.plant.GOAL_LOW, controller.plant.GOAL_HIGH
-    if isinstance(controller, gm.ScenarioMPC):
-        return goal + (high - low) * rng.uniform(2, 10, size=goal.shape) * rng.choice([-1, 1], size=goal.shape)
     while envs.can_hold(controller.plant, goal):
         goal = rng.uniform(low, high)
     return goal

@@ -183,11 +183,11 @@ def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
 
     problem, x0, psi = cstr_oracle.Oracle(20, compile=False), np.array([0.8, 0.4, 120.0, 118.0]), np.array([1.02, 0.95])
     guess = np.tile([20.0, -2000.0], (20, 1))
-    u = problem.solve(x0, psi, 5.0, guess)
+    u = problem.optimum(x0, psi, 5.0, guess)
     assert ((cstr.U_LOW - 1e-6 <= u) & (u <= cstr.U_HIGH + 1e-6)).all()
     (near, _, slack), (near_guess, _, slack_guess) = (cstr_oracle.measure(x0, psi, actions) for actions in (u, guess))
     assert near - 5 * slack > near_guess - 5 * slack_guess
-    assert -problem.last_objective == pytest.approx(near - 5 * slack, abs=1e-4)  # the model is the plant
+    assert -problem.objective == pytest.approx(near - 5 * slack, abs=1e-4)  # the model is the plant
 
 
 def test_a_critic_per_scenario_equals_twin_critics_one_by_one():

@@ -35,20 +35,12 @@ class FromGuess(goal_mpc.ScenarioMPC):
 
     guess = None
 
-    def guessed(self, x0):
-        w, at_x, at_u = np.zeros(self.size["w"]), self.positions("x"), self.positions("u")
-        x = np.zeros((at_x.shape[1], 4))
-        x[0] = x0
-        for child, before in enumerate(self.parent, start=1):
-            x[child] = cstr.step(x[before], self.guess[before], self.psi[:, child - 1])
-        w[at_x] = ((x - self.x_center) / self.x_scale).T
-        w[at_u] = ((self.guess - self.u_center) / self.u_scale).T
-        outside = np.hstack([np.maximum(cstr.X_LOW - x[1:], 0), np.maximum(x[1:] - cstr.X_HIGH, 0)]) / np.tile(self.x_scale, 2)
-        w[self.positions("slack")] = outside.T
-        return w
-
-    def cold_guesses(self):
-        return self.guessed, self.hold_guess
+    def first_guesses(self, x0):
+        x = [x0]
+        for before, scenario in zip(self.tree.parent[1:], self.tree.scenario[1:]):
+            x.append(cstr.step(x[before], self.guess[before], self.scenarios[scenario]))
+        yield self.vector(np.array(x[1:]), self.guess)
+        yield self.held(x0)
 
 
 class Given(deploy.ScenarioMPC):
@@ -71,16 +63,16 @@ def stacked(plan):
 
 def planned(controller, x, iterations, u_before=MIDDLE, given=None):
     """Actions and cost of a plan after that many iterations from the given actions, or from the policy's."""
-    controller.reset()
-    controller.u_before, controller.iterations, controller.given = u_before, iterations, given
+    controller.reset(u_before)
+    controller.iterations, controller.given = iterations, given
     controller.make_step(x)
     return stacked(controller.prediction()), controller.stats["cost"]
 
 
 def by_ipopt(ipopt, x, guess, u_before=MIDDLE):
     """Actions of IPOPT's plan, or None where it found none."""
-    ipopt.reset()
-    ipopt.u_before, ipopt.guess = u_before, guess
+    ipopt.reset(u_before)
+    ipopt.guess = guess
     ipopt.make_step(x)
     return stacked(ipopt.prediction()) if ipopt.stats["rung"] in ("solved", "retry") else None
 
@@ -132,7 +124,7 @@ def test_a_plan_of_ipopt_costs_what_ipopt_says():
     for x in states(20):
         guess, _ = planned(sqp, x, 0)
         found = by_ipopt(ipopt, x, guess)
-        assert planned(sqp, x, 0, given=found)[1] == pytest.approx(ipopt.last_objective, abs=1e-4 * (1 + abs(ipopt.last_objective)))
+        assert planned(sqp, x, 0, given=found)[1] == pytest.approx(ipopt.objective, abs=1e-4 * (1 + abs(ipopt.objective)))
 
 
 def test_the_sqp_comes_back_to_the_optimum_of_ipopt():
@@ -169,7 +161,7 @@ def test_changes_of_the_actions_cost_the_same_and_have_the_same_optimum():
         found = by_ipopt(ipopt, x, guess, before)
         same = planned(sqp, x, 0, before, found)[1]
         price = options["change_weight"] @ ((found[0] - before) ** 2 - (found[0] - MIDDLE) ** 2)
-        assert same == pytest.approx(ipopt.last_objective, abs=1e-4)
+        assert same == pytest.approx(ipopt.objective, abs=1e-4)
         assert same - planned(sqp, x, 0, MIDDLE, found)[1] == pytest.approx(price, rel=1e-6, abs=1e-9)
         cost = planned(sqp, x, 50, before, guess)[1]
         assert cost == pytest.approx(same, rel=1e-3, abs=1e-3)

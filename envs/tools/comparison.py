@@ -92,7 +92,8 @@ def output_folder(out, otherwise):
 
 def write_csv(rows, path):
     """Rows of equal keys as a table; a killed process leaves no half of it."""
-    with open(path.with_suffix(".tmp"), "w", newline="") as file:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path.with_suffix(".tmp"), "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)

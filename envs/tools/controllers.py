@@ -14,6 +14,25 @@ def call(function, *arguments):
     return function(*arguments[: function.n_in()])
 
 
+def checked_problem(plant, scenarios, slack_price, change_weight):
+    """What a planner is given, as new arrays: scenarios (S, n_psi), prices (2, n_x) of violations below and above, (n_u,) of changes.
+
+    Raises ValueError for other shapes, what is not finite or negative; an infinite slack_price is a hard bound.
+    """
+    n_psi, n_x, n_u = len(plant.PSI_NOMINAL), len(plant.X_LOW), len(plant.U_LOW)
+    scenarios = np.array(scenarios, dtype=float)
+    if scenarios.shape[1:] != (n_psi,) or not len(scenarios) or not np.isfinite(scenarios).all():
+        raise ValueError(f"scenarios have shape {scenarios.shape}; they must be finite, (S, {n_psi})")
+    prices = []
+    for name, price, shape, most in (("slack_price", slack_price, (2, n_x), np.inf), ("change_weight", change_weight, (n_u,), 1e300)):
+        price = np.array(price, dtype=float)
+        if price.ndim and price.shape != shape or not ((price >= 0) & (price <= most)).all():  # nor is nan
+            finite = "finite and " * (most < np.inf)
+            raise ValueError(f"{name} is {price.tolist()}; it must be a number or {shape}, {finite}not negative")
+        prices.append(np.broadcast_to(price, shape).copy())
+    return scenarios, *prices
+
+
 class Controller:
     """What every controller does around its action: `u = make_step(x0)`, `set_goal(goal)`, `reset()`, `stats`.
 
@@ -28,9 +47,12 @@ class Controller:
         self.set_goal(goal)
         self.reset()
 
-    def reset(self):
-        """Forget everything, as at the start of an episode."""
-        self.x_before, self.u_before = None, np.zeros(len(self.plant.U_LOW))
+    def reset(self, u=None):
+        """Forget everything, as at the start of an episode; u: the action (n_u,) that the plant gets now, default 0."""
+        u = np.zeros(len(self.plant.U_LOW)) if u is None else np.array(u, dtype=float).reshape(-1)
+        if u.shape != self.plant.U_LOW.shape or not np.isfinite(u).all():
+            raise ValueError(f"u is {u}; it must be {len(self.plant.U_LOW)} finite number(s): {', '.join(self.plant.ACTION_NAMES)}")
+        self.x_before, self.u_before = None, u
         self.stats = {}
         self.estimator.reset()
 
@@ -40,6 +62,11 @@ class Controller:
         Raises ValueError for another shape or a goal outside the plant's range.
         """
         self.goal = envs.checked_goal(self.plant, goal, self.horizon)
+
+    @property
+    def goals(self):
+        """A column per stage, (n_goal, N)."""
+        return np.broadcast_to(self.goal.reshape(len(self.goal), -1), (len(self.goal), self.horizon or 1))
 
     def make_step(self, x0):
         """The action (n_u,), finite and within its limits, for the measured state x0 (n_x,), physical units.

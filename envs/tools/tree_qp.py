@@ -21,8 +21,9 @@ class ScenarioTree:
     """Nodes of a tree over S scenarios that branches at the first `robust_horizon` stages, numbered stage by stage.
 
     nodes: how many per stage 0 ... horizon; first: the number of each stage's first node; inner: how many have children.
-    stage, parent (of the root: -1), scenario (on the way from the parent): of every node. later: which node's action each node with
-    children takes over one sampling time later, under the first scenario where the tree branches; in the last stage its own.
+    stage, parent (of the root: -1), scenario (on the way from the parent): of every node. child: of every node, under the first scenario
+    where the tree branches; of a leaf itself. later: which node's action each node with children takes over one sampling time later, its
+    child's; in the last stage its own.
     """
 
     def __init__(self, scenarios, horizon, robust_horizon):
@@ -46,9 +47,14 @@ class ScenarioTree:
             self.scenario[node] = order % scenarios
             if branching:
                 self.history[node, t - 1] = self.scenario[node]
-        self.later = np.arange(self.inner)
-        for node in range(self.inner - 1, 0, -1):
-            self.later[self.parent[node]] = node
+        self.child = np.arange(len(self.stage))
+        self.child[self.parent[:0:-1]] = np.arange(len(self.stage) - 1, 0, -1)
+        self.later = np.where(self.child < self.inner, self.child, np.arange(len(self.stage)))[: self.inner]
+
+    def by_stage(self, x, u):
+        """Lists over stages: of x (nodes - 1, n_x), x_1 ... x_N as (n_x, nodes); of u (inner, n_u), u_0 ... u_{N-1} as (n_u, nodes)."""
+        first = self.first[1:-1]
+        return {"x": [part.T for part in np.split(x, first[1:] - 1)], "u": [part.T for part in np.split(u, first[:-1])]}
 
     def weights(self, weight):
         """Weight of every node from those of the scenarios (S,); the weights of a stage sum to one."""
