@@ -36,13 +36,13 @@ import tyro
 from tqdm import tqdm
 
 import envs
-from envs.tools.arguments import check_effects, check_ranges, check_weights, goal_schedule
-from envs.tools.comparison import METRIC_SIGMA2, output_folder, write_csv
-from envs.tools.compiled import compiled_solver
-from envs.tools.controllers import Controller, checked_problem
-from envs.tools.figure import draw_episode
-from envs.tools.model import prediction_model, scaling
-from envs.tools.tree_qp import ScenarioTree
+from envs.control.compiled import compiled_solver
+from envs.control.controllers import Controller, checked_problem
+from envs.control.model import prediction_model, scaling
+from envs.control.tree_qp import ScenarioTree
+from envs.runs.arguments import check_effects, check_ranges, check_weights, goal_schedule
+from envs.runs.comparison import output_folder, write_csv
+from envs.runs.figure import draw_episode
 
 
 @dataclass(frozen=True)
@@ -384,7 +384,7 @@ def summary(plant, x, u, goals, log):
     unit = 1.0 if len(plant.U_LOW) == 1 else plant.U_HIGH - plant.U_LOW
     milliseconds = np.array([stats["wall_ms"] for stats in log])
     row = {
-        "time_near_goal": envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=METRIC_SIGMA2).sum(),
+        "time_near_goal": envs.time_near_goal(plant, x[1:, plant.GOAL_INDEX], goals),
         "action_total_variation": np.abs(np.diff(u / unit, axis=0, prepend=0.0)).sum(),
         "solve_ms_median": np.median(milliseconds),
         "solve_ms_p95": np.quantile(milliseconds, 0.95),

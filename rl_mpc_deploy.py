@@ -36,15 +36,15 @@ import torch
 import tyro
 
 import envs
-from envs.tools.arguments import check_effects, check_ranges, check_weights
-from envs.tools.checkpoint import read_checkpoint
-from envs.tools.comparison import draws, output_folder, parallel, run_episode, write_csv
-from envs.tools.compiled import OnArrays, compiled_functions
-from envs.tools.controllers import ActorController, Controller, GreedyController, call, checked_problem
-from envs.tools.expansion import check_export, expansion
-from envs.tools.figure import draw_episode
-from envs.tools.model import prediction_model, scaling
-from envs.tools.tree_qp import ScenarioTree, tree_qp
+from envs.agents.checkpoint import read_checkpoint
+from envs.control.compiled import OnArrays, compiled_functions
+from envs.control.controllers import ActorController, Controller, GreedyController, call, checked_problem
+from envs.control.expansion import check_export, expansion
+from envs.control.model import prediction_model, scaling
+from envs.control.tree_qp import ScenarioTree, tree_qp
+from envs.runs.arguments import check_effects, check_ranges, check_weights
+from envs.runs.comparison import draws, output_folder, parallel, run_episode, write_csv
+from envs.runs.figure import draw_episode
 
 # arguments that results.csv has columns for, or that change no result
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
@@ -207,7 +207,7 @@ class ScenarioMPC(Controller):
 
     A plan is its actions, one per node that has children; the states follow by rolling the tree out. An iteration
     linearises the dynamics about the plan, replaces the Hessian of every node's cost by its positive part, solves
-    the tree's quadratic program (envs/tools/tree_qp.c), and takes the largest share 1, 1/2, 1/4 ... of its step
+    the tree's quadratic program (envs/control/tree_qp.c), and takes the largest share 1, 1/2, 1/4 ... of its step
     that lowers the true cost as promised, which the new plan's rollout tells. So whenever it stops,
 
     - the plan satisfies the dynamics and the limits of the actions,

@@ -39,12 +39,12 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 import envs
-from envs.tools.arguments import check_effects, check_ranges
-from envs.tools.checkpoint import FORMAT, RESUME, plain, read_file, save
-from envs.tools.comparison import output_folder, read_trajectories, write_csv
-from envs.tools.evaluation import evaluation_row, evaluation_table
-from envs.tools.interrupt import until_interrupted
-from envs.tools.policy import Policy, Scaling, read_policy
+from envs.agents.checkpoint import FORMAT, RESUME, plain, read_file, save
+from envs.agents.evaluation import evaluation_row, evaluation_table
+from envs.agents.policy import Policy, Scaling, read_policy
+from envs.runs.arguments import check_effects, check_ranges
+from envs.runs.comparison import output_folder, read_trajectories, write_csv
+from envs.runs.interrupt import until_interrupted
 
 # of the arguments that a plant's TRAINING may set
 DEFAULTS = dict(hidden=(64, 64), total_timesteps=100_000, num_envs=32, gamma=0.99, steps_per_update=8)

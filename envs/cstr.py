@@ -7,7 +7,7 @@ equation lacks a `+` before the heat-transfer term, and Table 1 lists activation
 
 import numpy as np
 
-from envs import rk4, stack
+from envs.plant import grid, stack, stepper
 
 ENV_ID = "RLMPC/CSTR-v0"
 EPISODE_STEPS = 50
@@ -31,18 +31,14 @@ U_LOW = np.array([5.0, -8500.0])
 U_HIGH = np.array([100.0, 0.0])
 
 
-def _grid(alpha, beta):
-    return np.stack(np.meshgrid(alpha, beta, indexing="ij"), axis=-1).reshape(-1, 2)
-
-
 PSI_NAMES = ("alpha", "beta")
 PSI_NOMINAL = np.array([1.0, 1.0])
 SCENARIOS = {
     "nominal": PSI_NOMINAL[None],
-    "mpc": _grid([1.0, 0.95, 1.05], [1.0, 0.9, 1.1]),  # nominal first
-    "robust": _grid(np.linspace(0.95, 1.05, 10), np.linspace(0.9, 1.1, 10)),
+    "mpc": grid([1.0, 0.95, 1.05], [1.0, 0.9, 1.1]),  # nominal first
+    "robust": grid(np.linspace(0.95, 1.05, 10), np.linspace(0.9, 1.1, 10)),
 }
-EVAL_PSI = _grid(np.linspace(1.05, 0.95, 7), np.linspace(1.1, 0.9, 8))  # 8 of the 56 lie on the training grid
+EVAL_PSI = grid(np.linspace(1.05, 0.95, 7), np.linspace(1.1, 0.9, 8))  # 8 of the 56 lie on the training grid
 
 BENCHMARK = {  # the MPC that the paper compares with: hard bounds but for the upper one of T_R, quadratic cost
     "horizon": 20,
@@ -60,8 +56,8 @@ MISMATCH_SCALE = np.array([0.02, 0.02, 0.5, 0.5])  # mol/l, mol/l, degC, degC: w
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
 MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
-TRAINING = {}
 MPC_SIGMA2 = 0.01  # (mol/l)^2, of the stage cost in the authors' script; the paper's text says 0.0625
+METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints, as in the paper
 
 K0_AB = 1.287e12  # 1/h, rate constants (Table 1)
 K0_AD = 9.043e9  # l/(mol h)
@@ -98,10 +94,7 @@ def ode(x, u, psi, xp=np):
     )
 
 
-def step(x, u, psi, substeps=8):
-    """State one sampling time later with u held. Batched over the leading axes: x (..., 4), u (..., 2), psi (..., 2) -> (..., 4)."""
-    x, u, psi = (np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi))
-    return np.moveaxis(rk4(ode, x, u, psi, DT, substeps), 0, -1).copy()
+step = stepper(ode, DT)  # x (..., 4), u (..., 2), psi (..., 2) -> (..., 4)
 
 
 def goal_error(achieved, goal, xp=np):

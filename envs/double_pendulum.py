@@ -8,7 +8,7 @@ rod's rotational term, here corrected.
 
 import numpy as np
 
-from envs import rk4, stack
+from envs.plant import grid, stack, stepper
 
 ENV_ID = "RLMPC/DoublePendulum-v0"
 EPISODE_STEPS = 100
@@ -32,19 +32,15 @@ ACTION_UNITS = ("N",)
 U_LOW, U_HIGH = np.array([-5.0]), np.array([5.0])
 
 
-def _grid(factors):
-    return np.stack(np.meshgrid(factors, factors, factors, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
 PSI_NAMES = ("cart_mass", "rod_1_mass", "rod_2_mass")  # factors of the nominal masses
 PSI_NOMINAL = np.ones(3)
 SCENARIOS = {
     "nominal": PSI_NOMINAL[None],
-    "mpc": _grid([1.0, 0.95, 1.05]),  # nominal first
-    "extremes": np.concatenate([PSI_NOMINAL[None], _grid([0.95, 1.05])]),
-    "robust": _grid(np.linspace(0.95, 1.05, 10)),
+    "mpc": grid(*[[1.0, 0.95, 1.05]] * 3),  # nominal first
+    "extremes": np.concatenate([PSI_NOMINAL[None], grid(*[[0.95, 1.05]] * 3)]),
+    "robust": grid(*[np.linspace(0.95, 1.05, 10)] * 3),
 }
-EVAL_PSI = _grid(np.linspace(0.95, 1.05, 7))
+EVAL_PSI = grid(*[np.linspace(0.95, 1.05, 7)] * 3)
 
 BENCHMARK = {"horizon": 25, "slack_price": 1e3 * np.ones((2, 6)), "change_weight": np.zeros(1)}  # the quadratic agent
 EXPERT_CHANGE_WEIGHT = np.array([0.1])  # 1/N^2, of the expert agent's penalty on changes of the force
@@ -56,10 +52,10 @@ EVAL_GOAL = np.array(GOALS["up-up"])
 GOAL_LOW, GOAL_HIGH = -np.pi * np.ones(2), np.pi * np.ones(2)
 GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)  # of these the ones that `held_action` can hold
 ERROR_SCALE = np.ones(2)  # not used: both goals are angles
-REWARD_SIGMA2 = 0.01  # of 1 - cos(error), eq:smoothreward in the paper's "time near goal"
+REWARD_SIGMA2 = 0.01  # of 1 - cos(error)
 REWARD_TOLERANCE = 0.02  # 1 - cos of 0.2 rad
-TRAINING = {}
 MPC_SIGMA2 = 1.0  # eq:smoothreward as the stage cost of goal_mpc.py
+METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints, as in the paper
 MODEL_SUBSTEPS = 2  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
 
 GRAVITY = 9.80665  # m/s^2
@@ -96,10 +92,7 @@ def ode(x, u, psi, xp=np):
     return stack(xp, [x[3], omega_1, omega_2, (b0 - m01 * alpha_1 - m02 * alpha_2) / m00, alpha_1, alpha_2])
 
 
-def step(x, u, psi, substeps=8):
-    """State one sampling time later with u held. Batched over the leading axes: x (..., 6), u (..., 1), psi (..., 3) -> (..., 6)."""
-    x, u, psi = (np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi))
-    return np.moveaxis(rk4(ode, x, u, psi, DT, substeps), 0, -1).copy()
+step = stepper(ode, DT)  # x (..., 6), u (..., 1), psi (..., 3) -> (..., 6)
 
 
 def kinetic_energy(x, psi=PSI_NOMINAL, xp=np):

@@ -60,6 +60,7 @@ class Linear:
     EVAL_PSI = np.zeros((1, 0))
     REWARD_SIGMA2, REWARD_TOLERANCE = 0.25, 0.1  # squared norm of the state; half-width of the 0/1 reward in every state
     MPC_SIGMA2 = 0.5  # exp(-l) of eq:jensen
+    METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
     # what sac_her_branching.py trains with: over 90,000 parameters per network at n = 32
     TRAINING = {"hidden": (256, 256), "total_timesteps": 500_000, "num_envs": 64, "gamma": 0.9, "learning_starts": 10_000,
                 "steps_per_update": 16, "alpha_init": 0.005}  # fmt: skip
@@ -89,7 +90,7 @@ class Linear:
         held = 1 / np.abs(np.eye(n) - a).sum(axis=1)  # a goal is held by u = (I - A) g
         self.GOAL_REACHABLE = -held.min() * one, held.min() * one  # a cube within the goals that envs.can_hold tells exactly
         self.ERROR_SCALE = one
-        self.lqr = cache(self._lqr)
+        self.solved = {}  # discount: P and K
 
     def next_state(self, x, u, psi=None, xp=np):
         """A x + B u, components along the first axis: x (n, ...), u (n, ...); xp is numpy, torch or casadi."""
@@ -100,10 +101,11 @@ class Linear:
         """State one sampling time later. Batched over the leading axes: x (..., n), u (..., n) -> (..., n)."""
         return np.asarray(x, dtype=np.float64) @ self.A.T + np.asarray(u, dtype=np.float64)
 
-    def _lqr(self, gamma=1.0):
-        """P and K, (n, n) each, of the discounted regulator with M = R = I; `lqr` remembers them."""
-        one = np.eye(len(self.A))
-        return discounted_lqr(self.A, self.B, one, one, gamma)
+    def lqr(self, gamma=1.0):
+        """P and K, (n, n) each, of the discounted regulator with M = R = I."""
+        if gamma not in self.solved:
+            self.solved[gamma] = discounted_lqr(self.A, self.B, np.eye(len(self.A)), np.eye(len(self.A)), gamma)
+        return self.solved[gamma]
 
     def held_action(self, goal):
         """The action that holds a goal, (I - A) g: the linear-quadratic costs count deviations from it."""

@@ -44,7 +44,7 @@ import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.tools.expansion import expansion
+from envs.control.expansion import expansion
 
 LABELS = {
     "l4casadi": "do-mpc 4.6.5 + L4CasADi, same model",

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import bootstrap, trim_mean
 from tqdm import tqdm
 
-TOOLS = Path(__file__).resolve().parent.parent / "envs/tools"
+SHARED = Path(__file__).resolve().parent.parent / "envs"
 
 
 def fail(message):
@@ -94,10 +94,10 @@ def _fill(function, cell, path):
 def collect(function, cells, jobs, folder, inputs):
     """The rows `function(cell)` of all cells, in order, over `jobs` processes.
 
-    Cells are told apart by their repr; `inputs` are the files that results depend on, or their contents, beside the scripts' shared tools
+    Cells are told apart by their repr; `inputs` are the files that results depend on, or their contents, beside envs/
     (a change makes every cell new).
     """
-    inputs = [*inputs, *sorted([*TOOLS.glob("*.py"), *TOOLS.glob("*.c")])]
+    inputs = [*inputs, *sorted([*SHARED.rglob("*.py"), *SHARED.rglob("*.c")])]
     version = hashlib.sha256(b"".join(file if isinstance(file, bytes) else Path(file).read_bytes() for file in inputs)).digest()
     paths = [folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells]
     quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve

@@ -28,7 +28,7 @@ import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.tools.expansion import expansion
+from envs.control.expansion import expansion
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
 # what rows depend on, read when it is imported: an edit while loops run does not file old results under new code

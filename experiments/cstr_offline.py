@@ -35,8 +35,8 @@ import cells
 import envs
 import sac_her_branching as sac
 from envs import cstr
-from envs.tools.evaluation import evaluate
-from envs.tools.policy import Scaling
+from envs.agents.evaluation import evaluate
+from envs.agents.policy import Scaling
 
 STUDIES = {  # label: arguments of sac_her_branching.py
     "agents": {"robust": {}, "nominal": {"scenarios": "nominal"}},

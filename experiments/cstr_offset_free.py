@@ -34,7 +34,6 @@ from cstr_deploy import ACTOR, AWARE, PAPER, RL_MPC, TUNED
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.tools.comparison import METRIC_SIGMA2
 
 OBSERVING = dict(observe_mismatch=True, scenario_hold="episode")
 VARIANTS = {  # of the training: (arguments of sac_her_branching.py, mismatch scale times the default, seeds)
@@ -136,8 +135,8 @@ def run(case):
         late = error[args.steps // 2 :] if case.kind in ("step", "drift") else error
         row = {"case": case.kind, "controller": loop.variant, "noise": case.noise, "gain": args.filter_gain, "seed": args.seed,
                "episode": episode, "alpha": path[-1, 0], "beta": path[-1, 1],
-               "time_near_goal": envs.goal_reward(cstr, achieved, mpc.goal, sigma2=METRIC_SIGMA2).sum(),
-               "time_outside_constraints": envs.outside_constraints(cstr, x[1:], METRIC_SIGMA2).sum(),
+               "time_near_goal": envs.time_near_goal(cstr, achieved, mpc.goal),
+               "time_outside_constraints": envs.outside_constraints(cstr, x[1:]).sum(),
                "offset": error[-25:].mean(), "steps_over_2_percent": int((late > 2).sum()), "solve_ms_median": np.median(times),
                "solve_ms_p95": np.quantile(times, 0.95)}  # fmt: skip
         row = {k: round(float(v), 5) if isinstance(v, float) else v for k, v in row.items()}

@@ -37,7 +37,6 @@ from cstr_deploy import summary
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.tools.comparison import METRIC_SIGMA2
 
 WEIGHTS, FRONTIER = (1.0, 5.0), (0.3, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0)
 FRONTIER_DRAWS = 50
@@ -82,7 +81,7 @@ class Oracle(literal.IpoptMPC):
 
     def __init__(self, steps, compile):
         price = np.repeat([1.0, 0.0], [N_X, N_PSI])  # times the weight
-        stage = literal.gaussian(known_plant(), METRIC_SIGMA2)
+        stage = literal.gaussian(known_plant(), cstr.METRIC_SIGMA2)
         super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, slack_price=price, compile=compile)
 
     def build_problem(self, *costs):
@@ -115,8 +114,8 @@ def measure(x0, psi, u):
     for action in u:
         x.append(cstr.step(x[-1], np.clip(action, cstr.U_LOW, cstr.U_HIGH), psi))
     x = np.array(x)
-    near = envs.goal_reward(cstr, x[1:, cstr.GOAL_INDEX], cstr.EVAL_GOAL, sigma2=METRIC_SIGMA2).sum()
-    return near, envs.outside_constraints(cstr, x[1:], METRIC_SIGMA2).sum(), loops.slack(x)
+    near = envs.time_near_goal(cstr, x[1:, cstr.GOAL_INDEX], cstr.EVAL_GOAL)
+    return near, envs.outside_constraints(cstr, x[1:]).sum(), loops.slack(x)
 
 
 def best(cell):

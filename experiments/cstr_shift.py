@@ -36,7 +36,7 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
 from envs import cstr
-from envs.tools.policy import Scaling
+from envs.agents.policy import Scaling
 
 FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0)
 CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)

@@ -21,7 +21,7 @@ import cells
 
 import goal_mpc as gm
 from envs import double_pendulum as plant
-from envs.tools.figure import draw_episode
+from envs.runs.figure import draw_episode
 
 
 @dataclass
@@ -53,7 +53,7 @@ def collect(args):
         for i, name in enumerate(args.goals):
             part = slice(i * hold, (i + 1) * hold)
             row = gm.summary(plant, x[i * hold : (i + 1) * hold + 1], u[part], goals[part], log[part])
-            near = gm.envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=gm.METRIC_SIGMA2)[part]
+            near = gm.envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=plant.METRIC_SIGMA2)[part]
             row.pop("action_total_variation")  # is that of a whole episode
             reached = int(np.argmax(near > 0.9)) if near.max() > 0.9 else hold
             rows.append({"seed": seed, "equilibrium": name, "steps_to_reach": reached, "near_last_20": round(near[-20:].mean(), 6)} | row)

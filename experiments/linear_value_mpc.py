@@ -45,9 +45,8 @@ import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import linear
-from envs.tools.comparison import METRIC_SIGMA2
-from envs.tools.expansion import expansion
-from envs.tools.tree_qp import positive_part
+from envs.control.expansion import expansion
+from envs.control.tree_qp import positive_part
 
 CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None for goal_mpc.py)
     "RL (actor alone)": ("#D55E00", "--", dict(controllers=("actor",))),
@@ -212,7 +211,7 @@ def measures(plant, x, log):
     """The measures of linear_scalability.py, and solve times."""
     milliseconds = [s["wall_ms"] for s in log]
     return {
-        "steps_not_near": len(log) - envs.goal_reward(plant, x[1:], plant.EVAL_GOAL, sigma2=METRIC_SIGMA2).sum(),
+        "steps_not_near": len(log) - envs.time_near_goal(plant, x[1:], plant.EVAL_GOAL),
         "l2_error": np.sqrt((x[1:] ** 2).sum()),
         "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
         "final_norm": np.linalg.norm(x[-1]),

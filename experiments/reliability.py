@@ -45,8 +45,8 @@ import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
-from envs.tools.checkpoint import MAX_CHECKPOINT_BYTES
-from envs.tools.expansion import torch_value
+from envs.agents.checkpoint import MAX_CHECKPOINT_BYTES
+from envs.control.expansion import torch_value
 
 EPISODE = 25  # steps
 IPOPT = {  # goal_mpc.py's

@@ -36,8 +36,8 @@ import cells
 import envs
 import sac_her_branching as sac
 from envs import cstr
-from envs.tools.evaluation import evaluation_row
-from envs.tools.policy import Scaling
+from envs.agents.evaluation import evaluation_row
+from envs.agents.policy import Scaling
 
 VARIANTS = {  # of the arguments of sac_her_branching.py
     "default": [],

@@ -19,11 +19,11 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import cstr, double_pendulum
-from envs.tools import compiled
-from envs.tools.checkpoint import read_checkpoint
-from envs.tools.comparison import METRIC_SIGMA2, draws, run_episode
-from envs.tools.controllers import ActorController, GreedyController
-from envs.tools.expansion import check_export, expansion, torch_value
+from envs.agents.checkpoint import read_checkpoint
+from envs.control import compiled
+from envs.control.controllers import ActorController, GreedyController
+from envs.control.expansion import check_export, expansion, torch_value
+from envs.runs.comparison import draws, run_episode
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = ROOT / "experiments/pretrained"
@@ -843,7 +843,7 @@ def test_metrics_are_those_of_a_naive_loop(checkpoint):
         np.testing.assert_allclose(u[t], np.clip(np.array(mu(x[t], GOAL)).ravel(), cstr.U_LOW, cstr.U_HIGH))
         near += np.exp(-((0.65 - x[t + 1][1]) ** 2) / 0.02)
         outside += np.exp(-sum(max(v - h, low - v, 0) ** 2 for v, low, h in zip(x[t + 1], cstr.X_LOW, cstr.X_HIGH)) / 0.02) - 1
-    assert METRIC_SIGMA2 == 0.01
+    assert cstr.METRIC_SIGMA2 == 0.01
     assert row["time_near_goal"] == pytest.approx(near) and row["time_outside_constraints"] == pytest.approx(outside)
     assert row["ape_tail"] == pytest.approx(np.mean(100 * np.abs(x[-25:, 1] - 0.65) / 0.65))
     assert row["iterations"] == row["late"] == row["fell_back"] == 0

@@ -24,7 +24,7 @@ import reproduce  # noqa: E402
 
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
 SCRIPTS = {"sac_her_branching.py": sac_her_branching, "goal_mpc.py": goal_mpc, "rl_mpc_deploy.py": rl_mpc_deploy}
-SOURCES = [path for folder in (".", "envs", "envs/tools", "experiments") for path in sorted((ROOT / folder).glob("*.py"))]
+SOURCES = [path for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments") for path in sorted((ROOT / folder).glob("*.py"))]
 
 
 def commands():

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import envs
 from envs import cstr
+from envs.runs.comparison import new_folder
 
 
 def random_points(n, seed=0):
@@ -191,7 +192,7 @@ def test_a_goal_of_another_shape_or_outside_the_range_is_refused(plant, goal, ho
 
 
 def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path):
-    made = [envs.new_folder(tmp_path / "runs/cstr__0__1") for _ in range(3)]
+    made = [new_folder(tmp_path / "runs/cstr__0__1") for _ in range(3)]
     assert [path.name for path in made] == ["cstr__0__1", "cstr__0__1-2", "cstr__0__1-3"] and all(path.is_dir() for path in made)
 
 

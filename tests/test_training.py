@@ -14,7 +14,7 @@ import torch
 
 import envs
 import sac_her_branching as training
-from envs.tools.evaluation import evaluate
+from envs.agents.evaluation import evaluate
 
 ROOT = Path(__file__).parent.parent
 

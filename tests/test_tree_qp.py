@@ -12,8 +12,8 @@ import pytest
 
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.tools.comparison import draws, run_episode
-from envs.tools.tree_qp import ConicQP, ScenarioTree, TreeQP
+from envs.control.tree_qp import ConicQP, ScenarioTree, TreeQP
+from envs.runs.comparison import draws, run_episode
 
 pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="HPIPM's solver is compiled")
 TIGHT = {"piqp": {"eps_abs": 1e-10, "eps_rel": 1e-12}}

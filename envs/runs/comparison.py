@@ -1,6 +1,7 @@
 """Closed loops on paired draws of start state and plant, over several processes."""
 
 import csv
+import itertools
 import multiprocessing
 import signal
 import tempfile
@@ -10,8 +11,6 @@ import numpy as np
 from tqdm import tqdm
 
 import envs
-
-METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
 
 
 def draws(plant, episodes, seed):
@@ -33,8 +32,8 @@ def run_episode(controller, plant, x0, psi, goal, steps):
     milliseconds = [stats["wall_ms"] for stats in log]
     achieved = x[1:, plant.GOAL_INDEX]
     row = {
-        "time_near_goal": envs.goal_reward(plant, achieved, goal, sigma2=METRIC_SIGMA2).sum(),
-        "time_outside_constraints": envs.outside_constraints(plant, x[1:], METRIC_SIGMA2).sum(),
+        "time_near_goal": envs.time_near_goal(plant, achieved, goal),
+        "time_outside_constraints": envs.outside_constraints(plant, x[1:]).sum(),
         "ape_tail": plant.percentage_error(achieved, np.asarray(goal))[-25:].mean(),
         "solve_ms_median": np.median(milliseconds),
         "solve_ms_p95": np.quantile(milliseconds, 0.95),
@@ -79,10 +78,22 @@ def parallel(function, jobs, processes, first=0):
     return [future.result() for future in futures]
 
 
+def new_folder(path):
+    """Make the folder, or if another run has it already one with -2, -3, ... behind its name; returns the path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            pass
+
+
 def output_folder(out, otherwise):
     """The folder `out`, or a new one at the path `otherwise`, made and tried. Raises ValueError where it cannot be written."""
     try:
-        folder = out or envs.new_folder(otherwise)
+        folder = out or new_folder(otherwise)
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:

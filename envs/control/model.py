@@ -6,8 +6,8 @@ import envs
 
 
 def scaling(plant):
-    """Centre and half-width of the box of initial states, then of the actions: x = x_center + x_scale * scaled."""
-    return ((plant.INIT_LOW + plant.INIT_HIGH) / 2, (plant.INIT_HIGH - plant.INIT_LOW) / 2,
+    """Centre and half-width (1 where it has none) of the box of initial states, then of the actions: x = x_center + x_scale * scaled."""
+    return ((plant.INIT_LOW + plant.INIT_HIGH) / 2, envs.half_width(plant),
             (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2)  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from envs.tools.compiled import WHEEL, compiled
+from envs.control.compiled import WHEEL, compiled
 
 TOLERANCE, MOST_ITERATIONS = 1e-9, 60
 RIDGE = 1e-8  # on du, that of tree_qp.c

@@ -17,7 +17,8 @@ def call(function, *arguments):
 def checked_problem(plant, scenarios, slack_price, change_weight):
     """What a planner is given, as new arrays: scenarios (S, n_psi), prices (2, n_x) of violations below and above, (n_u,) of changes.
 
-    Raises ValueError for other shapes, what is not finite or negative; an infinite slack_price is a hard bound.
+    A price may be a number, or (n_x,) for both sides. Raises ValueError for other shapes, and what is negative or not finite; only
+    slack_price may be infinite, a hard bound.
     """
     n_psi, n_x, n_u = len(plant.PSI_NOMINAL), len(plant.X_LOW), len(plant.U_LOW)
     scenarios = np.array(scenarios, dtype=float)
@@ -26,7 +27,7 @@ def checked_problem(plant, scenarios, slack_price, change_weight):
     prices = []
     for name, price, shape, most in (("slack_price", slack_price, (2, n_x), np.inf), ("change_weight", change_weight, (n_u,), 1e300)):
         price = np.array(price, dtype=float)
-        if price.ndim and price.shape != shape or not ((price >= 0) & (price <= most)).all():  # nor is nan
+        if price.shape not in ((), shape[-1:], shape) or not ((price >= 0) & (price <= most)).all():  # nor is nan
             finite = "finite and " * (most < np.inf)
             raise ValueError(f"{name} is {price.tolist()}; it must be a number or {shape}, {finite}not negative")
         prices.append(np.broadcast_to(price, shape).copy())

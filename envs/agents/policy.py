@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 import envs
-from envs.tools.checkpoint import read_checkpoint
+from envs.agents.checkpoint import read_checkpoint
 
 
 class Scaling:

@@ -1,0 +1,1 @@
+"""What a trained agent is beside its networks: scaling, checkpoint files, evaluation."""

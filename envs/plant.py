@@ -1,0 +1,287 @@
+"""What a plant is: the names that a module of this folder has, their defaults, checks and measures, and Runge-Kutta steps."""
+
+import itertools
+
+import numpy as np
+
+
+def stack(xp, rows):
+    """Join the components of a derivative into one array, for numpy, torch and casadi alike (components along the first axis)."""
+    if xp is np:
+        return np.array(rows)  # half the time of np.stack at a batch of 1,024
+    return xp.vertcat(*rows) if hasattr(xp, "vertcat") else xp.stack(rows)
+
+
+def rk4(ode, x, u, psi, dt, substeps, xp=np):
+    """Classical Runge-Kutta steps of `ode(x, u, psi, xp)` over `dt` with the input held (components along the first axis)."""
+    h = dt / substeps
+    for _ in range(substeps):
+        k1 = ode(x, u, psi, xp)
+        k2 = ode(x + h / 2 * k1, u, psi, xp)
+        k3 = ode(x + h / 2 * k2, u, psi, xp)
+        k4 = ode(x + h * k3, u, psi, xp)
+        k2 += k3  # in place: a fifth faster than x + h / 6 * (k1 + 2 * (k2 + k3) + k4), which it computes
+        k2 *= 2
+        k2 += k1
+        k2 += k4
+        k2 *= h / 6
+        x = x + k2
+    return x
+
+
+def stepper(ode, dt, substeps=8):
+    """The simulated plant: `step(x, u, psi)`, the state one sampling time later with u held, batched over the leading axes, (..., n)."""
+
+    def step(x, u, psi, substeps=substeps):
+        x, u, psi = (np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi))
+        return np.moveaxis(rk4(ode, x, u, psi, dt, substeps), 0, -1).copy()
+
+    return step
+
+
+def grid(*values):
+    """All combinations of values of each parameter, (combinations, n_psi), the last parameter changing fastest."""
+    return np.array(list(itertools.product(*values)), dtype=float)
+
+
+REQUIRED = ("ENV_ID", "DT", "STATE_NAMES", "STATE_UNITS", "X_LOW", "X_HIGH", "ACTION_NAMES", "ACTION_UNITS", "U_LOW", "U_HIGH",
+            "GOAL_INDEX", "TRAIN_GOALS", "EVAL_GOAL")  # fmt: skip
+
+
+class Plant:
+    """A plant module, or what its `make` returns, with what it leaves out; see `envs/__init__.py` for the names.
+
+    Raises ValueError, one sentence, for a name that is missing, of the wrong shape or out of order.
+    """
+
+    def __init__(self, source, name, options=()):
+        self.source, self.name, self.options = source, name, dict(options)
+        missing = [each for each in REQUIRED if not hasattr(source, each)]
+        missing += [] if hasattr(source, "ode") or hasattr(source, "next_state") else ["ode"]
+        if missing:
+            raise ValueError(f"envs/{name}.py lacks {', '.join(missing)}")
+        self.defaults = _defaults(source)
+        _check(self)
+
+    def __getattr__(self, name):
+        if name in ("source", "defaults") or name.startswith("__"):  # not yet there, while it is copied
+            raise AttributeError(name)
+        if hasattr(self.source, name):
+            return getattr(self.source, name)
+        if name in self.defaults:
+            return self.defaults[name]
+        raise AttributeError(f"plant {self.name} has no {name}")
+
+    def __reduce__(self):
+        from envs import load  # a copy is the same plant: a module has no state
+
+        return _reload, (load, self.name, self.options)
+
+    def __repr__(self):
+        return f"<plant {self.name}{self.options or ''}>"
+
+
+def _reload(load, name, options):
+    return load(name, **options)
+
+
+def _defaults(p):
+    """Of every name that a plant need not have, its value."""
+    given = lambda name, default: np.asarray(getattr(p, name, default), dtype=float)  # noqa: E731
+    init_low, init_high = given("INIT_LOW", p.X_LOW), given("INIT_HIGH", p.X_HIGH)
+    half, index, angles = (init_high - init_low) / 2, list(p.GOAL_INDEX), list(getattr(p, "ANGLES", []))
+    scale = given("ERROR_SCALE", 0.05 * half[index])
+    goal_low, goal_high = given("GOAL_LOW", init_low[index]), given("GOAL_HIGH", init_high[index])
+    width, turning = float(np.mean(scale)), np.isin(index, angles)
+
+    nominal = given("PSI_NOMINAL", [])
+    ends = [given(name, nominal) for name in ("PSI_LOW", "PSI_HIGH")]
+    if nominal.size <= 2:
+        robust, evaluated = (grid(*(np.linspace(low, high, n) for low, high in zip(*ends))) for n in (10, 7))
+    else:  # a grid would be huge
+        robust, evaluated = (np.random.default_rng(seed).uniform(*ends, size=(n, nominal.size)) for seed, n in ((0, 1000), (1, 200)))
+    few = grid(*np.transpose([nominal, *ends])) if nominal.size <= 3 else np.stack([nominal, *ends])
+    few = np.concatenate([nominal[None], few[(few != nominal).any(axis=1)]])
+    sets = {"nominal": nominal[None], "mpc": few, "robust": robust}
+
+    def goal_error(achieved, goal, xp=np):
+        error = achieved - goal
+        if not turning.any():
+            return error
+        if hasattr(xp, "vertcat"):
+            return xp.vertcat(*(1 - xp.cos(error[i]) if turn else error[i] for i, turn in enumerate(turning)))
+        return xp.stack([1 - xp.cos(error[..., i]) if turn else error[..., i] for i, turn in enumerate(turning)], -1)
+
+    def percentage_error(achieved, goal):
+        error = np.where(turning, (achieved - goal + np.pi) % (2 * np.pi) - np.pi, achieved - goal)
+        return (100 * np.abs(error) / np.where(turning, np.pi, half[index])).mean(-1)
+
+    values = dict(EPISODE_STEPS=50, TIME_UNIT="s", INIT_LOW=init_low, INIT_HIGH=init_high, ANGLES=[], MODEL_SUBSTEPS=4, TRAINING={})
+    values |= dict(OBS_LOW=np.full(len(half), -np.inf), OBS_HIGH=np.full(len(half), np.inf))
+    values |= dict(START=(init_low + init_high) / 2, START_NOISE=half / 10)
+    values |= dict(PSI_NAMES=tuple(f"psi_{i + 1}" for i in range(nominal.size)), PSI_NOMINAL=nominal, SCENARIOS=sets, EVAL_PSI=evaluated)
+    values |= dict(GOAL_LOW=goal_low, GOAL_HIGH=goal_high, GOAL_REACHABLE=(goal_low, goal_high), ERROR_SCALE=scale)
+    values |= dict(REWARD_SIGMA2=(width / 5) ** 2, REWARD_TOLERANCE=width / 5, MPC_SIGMA2=(2 * width) ** 2, METRIC_SIGMA2=(2 * width) ** 2)
+    benchmark = dict(horizon=20, slack_price=np.full((2, len(half)), np.inf), change_weight=np.zeros(len(p.U_LOW)))
+    values |= dict(BENCHMARK=benchmark, goal_error=goal_error, percentage_error=percentage_error)
+    if hasattr(p, "ode"):
+        values["step"] = stepper(p.ode, p.DT)
+    else:
+        values["MODEL_SUBSTEPS"] = 1
+
+        def step(x, u, psi):
+            return np.moveaxis(p.next_state(*(np.moveaxis(np.asarray(a, dtype=float), -1, 0) for a in (x, u, psi))), 0, -1)
+
+        values["step"] = step
+    return values
+
+
+def _check(p):
+    """Shapes, order and finite numbers of a `Plant`."""
+    n_x, n_u, n_goal, n_psi = len(p.STATE_NAMES), len(p.ACTION_NAMES), len(p.GOAL_INDEX), len(np.atleast_1d(p.PSI_NOMINAL))
+    vectors = dict.fromkeys(("X_LOW", "X_HIGH", "INIT_LOW", "INIT_HIGH", "OBS_LOW", "OBS_HIGH", "START", "START_NOISE"), n_x)
+    vectors |= dict.fromkeys(("U_LOW", "U_HIGH"), n_u) | dict.fromkeys(("EVAL_GOAL", "GOAL_LOW", "GOAL_HIGH", "ERROR_SCALE"), n_goal)
+    may_be_infinite = ("X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH")
+    shapes = {name: (np.asarray(getattr(p, name)), (n,)) for name, n in vectors.items()}
+    shapes |= {"PSI_NOMINAL": (np.asarray(p.PSI_NOMINAL), (n_psi,)), "TRAIN_GOALS": (np.asarray(p.TRAIN_GOALS), (None, n_goal))}
+    shapes |= {f"SCENARIOS[{name!r}]": (np.asarray(value), (None, n_psi)) for name, value in p.SCENARIOS.items()}
+    shapes["EVAL_PSI"] = np.asarray(p.EVAL_PSI), (None, n_psi)
+    for name, (value, shape) in shapes.items():
+        wanted = tuple(len(value) if n is None and value.ndim else n for n in shape)
+        if value.shape != wanted or not len(value) and None in shape:
+            raise ValueError(f"envs/{p.name}.py: {name} has shape {value.shape}; it must be {shape}".replace("None", "any"))
+        if np.isnan(value).any() or name not in may_be_infinite and not np.isfinite(value).all():
+            hint = "; give INIT_LOW and INIT_HIGH, where episodes start" if name in ("INIT_LOW", "INIT_HIGH") else ""
+            raise ValueError(f"envs/{p.name}.py: {name} is {value.tolist()}; it must be finite{hint}")
+    for box in ("X", "INIT", "OBS", "U", "GOAL"):
+        low, high = f"{box}_LOW", f"{box}_HIGH"
+        below, above = getattr(p, low), getattr(p, high)
+        if not (np.less if low == "U_LOW" else np.less_equal)(below, above).all():
+            raise ValueError(f"envs/{p.name}.py: {low} is {np.asarray(below).tolist()}, {high} {np.asarray(above).tolist()}; not in order")
+    for names, units, n in (("STATE_NAMES", "STATE_UNITS", n_x), ("ACTION_NAMES", "ACTION_UNITS", n_u)):
+        if len(getattr(p, units)) != n:
+            raise ValueError(f"envs/{p.name}.py: {units} are {len(getattr(p, units))}, {names} {n}")
+    for name in ("GOAL_INDEX", "ANGLES"):
+        if not all(isinstance(i, (int, np.integer)) and 0 <= i < n_x for i in getattr(p, name)):
+            raise ValueError(f"envs/{p.name}.py: {name} is {getattr(p, name)}; it must be indices of the {n_x} states")
+    for name in ("nominal", "mpc", "robust"):
+        if name not in p.SCENARIOS:
+            raise ValueError(f"envs/{p.name}.py: SCENARIOS lacks {name!r}")
+    if not (np.isscalar(p.DT) and p.DT > 0):
+        raise ValueError(f"envs/{p.name}.py: DT is {p.DT!r}; it must be a positive number")
+    try:
+        x_next = np.asarray(p.step(np.asarray(p.START, float), (np.asarray(p.U_LOW) + p.U_HIGH) / 2, np.asarray(p.PSI_NOMINAL, float)))
+    except Exception as error:  # whatever the plant's own equations raise
+        raise ValueError(f"envs/{p.name}.py: a step from START fails ({type(error).__name__}: {error})") from error
+    if x_next.shape != (n_x,) or not np.isfinite(x_next).all():
+        raise ValueError(f"envs/{p.name}.py: a step from START gives {x_next.tolist()}; it must be {n_x} finite numbers")
+
+
+def reachable_goals(plant, actions=1600, steps=500):
+    """Lowest and highest goal that every scenario of the set "mpc" holds at steady state within the constraints, (1,) each.
+
+    To be written down as GOAL_REACHABLE of a plant with one goal, no angle, that comes to rest by itself: about so many constant actions, a
+    grid or random ones, are held for so many steps from START. Raises ValueError for another plant, or where nothing is held.
+    """
+    if len(plant.GOAL_INDEX) != 1 or plant.GOAL_INDEX[0] in plant.ANGLES:
+        raise ValueError("reachable_goals needs a plant with one goal, which is no angle")
+    n_u = len(plant.U_LOW)
+    u = grid(*np.linspace(plant.U_LOW, plant.U_HIGH, round(actions ** (1 / n_u))).T) if n_u <= 3 else None
+    u = np.random.default_rng(0).uniform(plant.U_LOW, plant.U_HIGH, size=(actions, n_u)) if u is None else u
+    ends = []
+    for psi in plant.SCENARIOS["mpc"]:
+        x, psi = np.tile(np.asarray(plant.START, dtype=float), (len(u), 1)), np.tile(psi, (len(u), 1))
+        for _ in range(steps):
+            x, before = plant.step(x, u, psi), x
+        rests = (np.abs(x - before) < 1e-6 * half_width(plant)).all(axis=1)
+        goals = x[rests & ((plant.X_LOW <= x) & (x <= plant.X_HIGH)).all(axis=1), plant.GOAL_INDEX[0]]
+        ends.append((goals.min(initial=np.inf), goals.max(initial=-np.inf)))
+    low, high = np.max(ends, axis=0)[:1], np.min(ends, axis=0)[1:]
+    if not low <= high:
+        raise ValueError(f"no goal of {plant.ENV_ID} is held by every scenario")
+    return low, high
+
+
+# Measures
+
+
+def half_width(plant):
+    """Half the width of the box of initial states, (n_x,), by which states are scaled; 1 where it has none."""
+    half = (np.asarray(plant.INIT_HIGH) - plant.INIT_LOW) / 2
+    return np.where(half > 0, half, 1.0)
+
+
+def sample_states(plant, rng, n):
+    """Initial states uniform in their box, (n, n_x)."""
+    if hasattr(plant, "sample_states"):
+        return plant.sample_states(rng, n)
+    return rng.uniform(plant.INIT_LOW, plant.INIT_HIGH, size=(n, len(plant.INIT_LOW)))
+
+
+def scenario_set(plant, name):
+    """Parameters (S, n_psi) of the plant's scenario set, the nominal ones first, whether the set has them or not.
+
+    Raises ValueError for a set that the plant does not have.
+    """
+    if name not in plant.SCENARIOS:
+        raise ValueError(f"--scenarios {name} is not a scenario set of {plant.ENV_ID}; choose one of {', '.join(plant.SCENARIOS)}")
+    scenarios = np.asarray(plant.SCENARIOS[name])
+    return np.concatenate([plant.PSI_NOMINAL[None], scenarios[(scenarios != plant.PSI_NOMINAL).any(axis=1)]])
+
+
+def goal_reward(plant, achieved, goal, smooth=True, sigma2=None, tolerance=None, xp=np):
+    """Reward of reaching `achieved` under `goal`, both (..., n_goal): Gaussian (eq:goalreward), or 0/1 (eq:sparsereward)."""
+    error = plant.goal_error(achieved, goal, xp)
+    if smooth:
+        return xp.exp(-(error**2).sum(-1) / (2 * (plant.REWARD_SIGMA2 if sigma2 is None else sigma2)))
+    return 1.0 * (abs(error) <= (plant.REWARD_TOLERANCE if tolerance is None else tolerance)).all(-1)
+
+
+def time_near_goal(plant, achieved, goal):
+    """The paper's measure of a trajectory (..., T, n_goal): sum over T of exp(-|error|^2 / (2 METRIC_SIGMA2)), (...)."""
+    return goal_reward(plant, achieved, np.asarray(goal), sigma2=plant.METRIC_SIGMA2).sum(-1)
+
+
+def outside_constraints(plant, x, xp=np):
+    """The paper's measure of constraint violation, exp(-|x - clip(x)|^2 / (2 METRIC_SIGMA2)) - 1, x (..., n_x) -> (...): 0 inside."""
+    low, high = (xp.asarray(bound, dtype=x.dtype, device=x.device) for bound in (plant.X_LOW, plant.X_HIGH))
+    return xp.exp(-((x - xp.clip(x, low, high)) ** 2).sum(-1) / (2 * plant.METRIC_SIGMA2)) - 1
+
+
+def can_hold(plant, goals):
+    """Whether every scenario can hold each goal at steady state, (..., n_goal) -> (...)."""
+    if hasattr(plant, "held_action"):
+        action = np.apply_along_axis(plant.held_action, -1, np.asarray(goals))
+        return ((plant.U_LOW <= action) & (action <= plant.U_HIGH)).all(-1)
+    low, high = plant.GOAL_REACHABLE
+    return ((low <= goals) & (goals <= high)).all(-1)
+
+
+# Checks
+
+
+def checked_state(plant, x0):
+    """The measured state as a new float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
+    x0 = np.array(x0, dtype=float)
+    if x0.shape != plant.X_LOW.shape:
+        raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"state is {np.array2string(x0, threshold=8)}; every entry must be finite")
+    return x0
+
+
+def checked_goal(plant, goal, horizon=None):
+    """The goal as a new float array: (n_goal,) from that many numbers, or from one if there is one; with a horizon also (n_goal, horizon).
+
+    Raises ValueError for another shape, or an entry outside the plant's range or not finite.
+    """
+    n, goal = len(plant.GOAL_INDEX), np.array(goal, dtype=float)
+    goal = goal.reshape(1) if goal.ndim == 0 and n == 1 else goal
+    low, high = plant.GOAL_LOW, plant.GOAL_HIGH
+    shown, low_shown, high_shown = (np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high))
+    if goal.shape not in ((n,), (n, horizon)):
+        stages = f", or {n} for each of {horizon} stages" if horizon else ""
+        raise ValueError(f"goal is {shown}; {plant.ENV_ID} needs {n} number(s){stages}")
+    if not ((low <= goal.T) & (goal.T <= high)).all():  # nor is nan
+        raise ValueError(f"goal is {shown}; {plant.ENV_ID} takes {low_shown} to {high_shown}")
+    return goal
