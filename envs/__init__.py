@@ -1,42 +1,47 @@
-"""Plants as goal-conditioned gymnasium environments. A module in this folder that has an ENV_ID is a plant: `--env NAME` means `envs/NAME.py`.
+"""Plants as goal-conditioned gymnasium environments. A module here that has an ENV_ID is a plant, `--env` its name.
 
 A plant is constants and functions, no gymnasium code (`envs/cstr.py` is the pattern). It must name
 
-    ENV_ID, DT                                    gymnasium id, sampling time
+    ENV_ID, DT                  gymnasium id, sampling time
     STATE_NAMES, STATE_UNITS, ACTION_NAMES, ACTION_UNITS
-    X_LOW, X_HIGH                                 constraint box, (n_x,), infinite where there is no constraint
-    U_LOW, U_HIGH                                 actuator limits, (n_u,)
-    GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL            which states the goal is about, goals of training (k, n_goal), goal of the evaluation
-    ode(x, u, psi, xp)                            time derivative, components along the first axis; xp is numpy, torch or casadi
-      or next_state(x, u, psi, xp)                for a plant in discrete time
-    PSI_NOMINAL, PSI_LOW, PSI_HIGH                if something is uncertain: its nominal value and its range, (n_psi,)
+    X_LOW, X_HIGH               constraint box, (n_x,), infinite where there is no constraint
+    U_LOW, U_HIGH               actuator limits, (n_u,)
+    GOAL_INDEX                  which states the goal is about
+    TRAIN_GOALS, EVAL_GOAL      goals of training (k, n_goal), goal of the evaluation (n_goal,)
+    ode(x, u, psi, xp)          time derivative, components along the first axis; xp is numpy, torch or casadi
+      or next_state(...)        the state one sampling time later, of a plant in discrete time
+    PSI_NOMINAL, PSI_LOW, PSI_HIGH    if something is uncertain: its nominal value and its range, (n_psi,)
 
-What it may name beside that, with the default that it otherwise has:
+It may name, in place of the default in brackets:
 
-    EPISODE_STEPS, TIME_UNIT                      steps before truncation (50), unit of DT ("s")
-    INIT_LOW, INIT_HIGH                           box of initial states, finite: it also scales states for networks and solvers (X_LOW, X_HIGH)
-    OBS_LOW, OBS_HIGH                             box that every reachable state stays in (infinite)
-    ANGLES                                        indices of states that are angles: networks see their sine and cosine (none)
-    START, START_NOISE                            one start state, and how far a seed moves it (middle of the box, a tenth of its half-width)
-    PSI_NAMES, SCENARIOS, EVAL_PSI                sets to draw psi from, all made from PSI_LOW and PSI_HIGH: "nominal", "mpc" (planners branch
-                                                  over it: all combinations of nominal, low and high), "robust" (training); evaluation's plants
-    GOAL_LOW, GOAL_HIGH, GOAL_REACHABLE           range of goals (the box of initial states), box of those that every scenario can hold (the
-                                                  same; `reachable_goals` finds it), or held_action(goal), infinite if none holds it
-    ERROR_SCALE                                   size of a large goal error, (n_goal,), for the networks (a twentieth of the half-width)
-    REWARD_SIGMA2, REWARD_TOLERANCE               sigma^2 of the Gaussian reward, half-width of the sparse one ((ERROR_SCALE / 5)^2 and that)
-    MPC_SIGMA2, METRIC_SIGMA2                     sigma^2 of the planners' stage cost, and of the measures ((2 ERROR_SCALE)^2)
-    MODEL_SUBSTEPS, step(x, u, psi)               Runge-Kutta steps per sampling time in predictions (4); the simulated plant (8 of them)
-    goal_error(achieved, goal, xp)                whose squared norm enters the Gaussian (difference; of angles 1 - cos)
-    percentage_error(achieved, goal)              for tables (percent of the box's half-width)
-    TRAINING                                      arguments of sac_her_branching.py whose defaults it changes ({})
-    BENCHMARK                                     the MPC that rl_mpc_deploy.py compares with: "horizon" (20), "slack_price" (2, n_x), below and
-                                                  above (inf: a hard bound, 0: none), "change_weight" (n_u,) (0)
-    MISMATCH_SCALE                                for --observe-mismatch: a large difference between model and plant after one step, (n_x,)
-    GOALS, expert_cost(x, xp), EXPERT_CHANGE_WEIGHT, animate(...)    for goal_mpc.py: goals by name, another objective, a film
+    EPISODE_STEPS, TIME_UNIT    steps before truncation (50), unit of DT ("s")
+    INIT_LOW, INIT_HIGH         box of initial states, finite; it also scales states (X_LOW, X_HIGH)
+    OBS_LOW, OBS_HIGH           box that every reachable state stays in (infinite)
+    ANGLES                      indices of states that are angles: networks see sine and cosine (none)
+    START, START_NOISE          a start state, and how far a seed moves it (the box's middle, a twentieth of its width)
+    PSI_NAMES, SCENARIOS,       sets to draw psi from: "nominal", "mpc" (planners branch over it), "robust" (training);
+      EVAL_PSI                  plants of the evaluation (from PSI_LOW and PSI_HIGH: ends and nominal, 10 and 7 each)
+    GOAL_LOW, GOAL_HIGH         range of goals (the box of initial states)
+    GOAL_REACHABLE              box of those that every scenario can hold, see `reachable_goals` (GOAL_LOW, GOAL_HIGH);
+      or held_action(goal)      the action that holds a goal, infinite if none does
+    ERROR_SCALE                 a large goal error, (n_goal,), for the networks (a fortieth of the box's width)
+    REWARD_SIGMA2               sigma^2 of the Gaussian reward ((ERROR_SCALE / 5)^2)
+    REWARD_TOLERANCE            half-width of the sparse reward (ERROR_SCALE / 5)
+    MPC_SIGMA2, METRIC_SIGMA2   sigma^2 of the planners' stage cost and of the measures ((2 ERROR_SCALE)^2)
+    MODEL_SUBSTEPS              Runge-Kutta steps per sampling time in predictions (4)
+    step(x, u, psi)             the simulated plant, batched (8 Runge-Kutta steps)
+    goal_error(achieved, goal, xp)    its squared norm enters the Gaussian (difference; of angles 1 - cos)
+    percentage_error(achieved, goal)  for tables (percent of half the box's width)
+    TRAINING                    arguments of sac_her_branching.py whose defaults it changes ({})
+    BENCHMARK                   the MPC that rl_mpc_deploy.py compares with: "horizon" (20), "slack_price" (2, n_x) below
+                                and above, inf: a hard bound (all), "change_weight" (n_u,) (0)
+    MISMATCH_SCALE              for --observe-mismatch: a large difference to the model after one step, (n_x,)
+    GOALS, expert_cost, EXPERT_CHANGE_WEIGHT, animate    for goal_mpc.py: goals by name, another objective, a film
 
-A family of plants (`envs/linear.py`) defines `make(dim, system)` instead, which returns an object with these names; one with a
-linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline. `plant.py` holds defaults, checks and measures, `goal_env.py`
-the environments, `estimation.py` what transitions tell; `control/`, `agents/` and `runs/` are what the scripts share beside plants.
+A family of plants (`envs/linear.py`) defines `make(dim, system)`, which returns an object with these names; one with a
+linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline. `plant.py` holds defaults, checks and
+measures, `goal_env.py` the environments, `estimation.py` what transitions tell; `control/`, `agents/` and `runs/` are
+what the scripts share beside plants.
 """
 
 import importlib
@@ -69,9 +74,13 @@ from envs.plant import (  # noqa: F401
 
 
 def _ids():
-    """{name: ENV_ID} of the plants in this folder, read and not imported, so that a broken one does no harm to the others."""
-    texts = {path.stem: path.read_text(encoding="utf-8", errors="replace") for path in sorted(Path(__file__).parent.glob("*.py"))}
-    found = {name: re.search(r"""^[ \t]*ENV_ID\b[^=\n]*=\s*\(?["']([^"']+)["']""", text, re.MULTILINE) for name, text in texts.items()}
+    """{name: ENV_ID} of the plants in this folder (and others on `envs.__path__`), read and not imported: a broken one harms no other."""
+    files = sorted(path for folder in __path__ for path in Path(folder).glob("*.py"))
+    texts = {path.stem: path.read_text(encoding="utf-8", errors="replace") for path in files}
+    found = {
+        name: re.search(r"""^[ \t]*ENV_ID\b[^=\n]*=\s*\(?["']([^"']+)["']""", text, re.MULTILINE)
+        for name, text in texts.items()
+    }
     return {name: match[1] for name, match in found.items() if match and name != "__init__"}
 
 
@@ -87,7 +96,9 @@ def load(name, observe_mismatch=False, **options):
     there (with the list of what is), cannot be imported, lacks a name or shares its ENV_ID, and for an option that it does not take.
     """
     plant = _load(name, tuple(sorted((k, v) for k, v in options.items() if v is not None)))
-    return Mismatch(plant, None if observe_mismatch is True else observe_mismatch) if observe_mismatch else plant
+    return (
+        Mismatch(plant, None if observe_mismatch is True else observe_mismatch) if observe_mismatch else plant
+    )
 
 
 @cache
@@ -95,9 +106,11 @@ def _load(name, options):
     ids = _ids()
     if name not in ids:
         raise ValueError(f"--env {name!r} is not a plant of this folder; choose one of {', '.join(ids)}")
-    same = [other for other, env_id in ids.items() if env_id == ids[name]]
+    same = sorted(other for other, env_id in ids.items() if env_id == ids[name])
     if len(same) > 1:
-        raise ValueError(f"--env {name}: {' and '.join(f'envs/{other}.py' for other in same)} have the same ENV_ID; give one another")
+        raise ValueError(
+            f"--env {name}: {' and '.join(f'envs/{other}.py' for other in same)} have the same ENV_ID; give one another"
+        )
     try:
         module = importlib.import_module(f"{__name__}.{name}")
     except Exception as error:  # whatever a half-written plant raises
@@ -111,4 +124,9 @@ def _load(name, options):
 
 for _name, _env_id in _ids().items():
     if _env_id not in gym.registry:
-        gym.register(_env_id, entry_point="envs:GoalEnv", vector_entry_point="envs:VectorGoalEnv", kwargs={"plant": _name})
+        gym.register(
+            _env_id,
+            entry_point="envs:GoalEnv",
+            vector_entry_point="envs:VectorGoalEnv",
+            kwargs={"plant": _name},
+        )

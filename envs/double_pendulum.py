@@ -21,11 +21,15 @@ X_LOW = np.array([-5.0, -np.inf, -np.inf, -np.inf, -np.inf, -np.inf])  # the tra
 X_HIGH = -X_LOW
 INIT_LOW = np.array([-1.0, -np.pi, -np.pi, -1.0, -5.0, -5.0])
 INIT_HIGH = -INIT_LOW
-OBS_LOW = np.array([-200.0, -1000.0, -1000.0, -100.0, -200.0, -200.0])  # far beyond what 5 N and the initial energy reach in an episode
+OBS_LOW = np.array(
+    [-200.0, -1000.0, -1000.0, -100.0, -200.0, -200.0]
+)  # far beyond what 5 N and the initial energy reach in an episode
 OBS_HIGH = -OBS_LOW
 ANGLES = [1, 2]  # the networks see them as sine and cosine
 START = np.array([0.0, 0.9 * np.pi, 0.9 * np.pi, 0.0, 0.0, 0.0])  # the paper's: at rest, nearly hanging
-START_NOISE = np.array([0.0, 0.05, 0.05, 0.0, 0.0, 0.0])  # half-width of what the seed of goal_mpc.py adds to it
+START_NOISE = np.array(
+    [0.0, 0.05, 0.05, 0.0, 0.0, 0.0]
+)  # half-width of what the seed of goal_mpc.py adds to it
 
 ACTION_NAMES = ("force",)
 ACTION_UNITS = ("N",)
@@ -42,11 +46,19 @@ SCENARIOS = {
 }
 EVAL_PSI = grid(*[np.linspace(0.95, 1.05, 7)] * 3)
 
-BENCHMARK = {"horizon": 25, "slack_price": 1e3 * np.ones((2, 6)), "change_weight": np.zeros(1)}  # the quadratic agent
+BENCHMARK = {
+    "horizon": 25,
+    "slack_price": 1e3 * np.ones((2, 6)),
+    "change_weight": np.zeros(1),
+}  # the quadratic agent
 EXPERT_CHANGE_WEIGHT = np.array([0.1])  # 1/N^2, of the expert agent's penalty on changes of the force
 
 GOAL_INDEX = [1, 2]  # the goal is a pair of angles, rad
-GOALS = {"up-up": (0.0, 0.0), "up-down": (0.0, np.pi), "down-up": (np.pi, 0.0)}  # the unstable equilibria, inner rod first
+GOALS = {
+    "up-up": (0.0, 0.0),
+    "up-down": (0.0, np.pi),
+    "down-up": (np.pi, 0.0),
+}  # the unstable equilibria, inner rod first
 TRAIN_GOALS = np.array(list(GOALS.values()))
 EVAL_GOAL = np.array(GOALS["up-up"])
 GOAL_LOW, GOAL_HIGH = -np.pi * np.ones(2), np.pi * np.ones(2)
@@ -140,7 +152,9 @@ def skeleton(x):
     x = np.asarray(x)
     cart = np.stack([x[..., 0], 0 * x[..., 0]], axis=-1)
     joint = cart + LENGTH_1 * np.stack([np.sin(x[..., 1]), np.cos(x[..., 1])], axis=-1)
-    return np.stack([cart, joint, joint + LENGTH_2 * np.stack([np.sin(x[..., 2]), np.cos(x[..., 2])], axis=-1)], axis=-2)
+    return np.stack(
+        [cart, joint, joint + LENGTH_2 * np.stack([np.sin(x[..., 2]), np.cos(x[..., 2])], axis=-1)], axis=-2
+    )
 
 
 def animate(x, u, predicted, goals, path, every=2):
@@ -161,12 +175,21 @@ def animate(x, u, predicted, goals, path, every=2):
     (cart,) = ax.plot([], [], "s", color="black", ms=16)
     (force,) = ax.plot([], [], color="#D55E00", lw=5)
     clock = ax.text(0.02, 0.93, "", transform=ax.transAxes)
-    ax.legend([rods, ghosts, target, force], ["rods", "prediction", "goal", "force"], loc="upper right", ncols=4, fontsize=8, frameon=False)
+    ax.legend(
+        [rods, ghosts, target, force],
+        ["rods", "prediction", "goal", "force"],
+        loc="upper right",
+        ncols=4,
+        fontsize=8,
+        frameon=False,
+    )
     ax.set(ylim=(-1.2, 1.5), aspect="equal", xlabel="position [m]", yticks=[])
     ax.axhline(0, color="grey", lw=1, zorder=0)
     for end in (X_LOW[0], X_HIGH[0]):
         ax.plot([end, end], [-0.35, 0.35], color="black", lw=4)  # the track's ends
-    view = np.convolve(np.pad(skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid")  # the camera follows the cart
+    view = np.convolve(
+        np.pad(skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid"
+    )  # the camera follows the cart
 
     def draw(t):
         points = skeleton(x[t])
@@ -183,5 +206,7 @@ def animate(x, u, predicted, goals, path, every=2):
         clock.set_text(f"t = {t * DT:4.1f} s")
 
     frames = range(0, len(u), every)
-    FuncAnimation(fig, draw, frames=frames).save(path, writer=PillowWriter(fps=round(1 / (every * DT), 2)), dpi=80)
+    FuncAnimation(fig, draw, frames=frames).save(
+        path, writer=PillowWriter(fps=round(1 / (every * DT), 2)), dpi=80
+    )
     plt.close(fig)

@@ -19,7 +19,14 @@ class Mismatch:
             raise ValueError(f"--observe-mismatch: {plant.ENV_ID} has no MISMATCH_SCALE")
         self.plant, n = plant, len(plant.X_LOW)
         self.MISMATCH_SCALE = plant.MISMATCH_SCALE if scale is None else np.array(scale)
-        extra = {"X_LOW": -np.inf, "X_HIGH": np.inf, "INIT_LOW": 0.0, "INIT_HIGH": 0.0, "OBS_LOW": -1.0, "OBS_HIGH": 1.0}
+        extra = {
+            "X_LOW": -np.inf,
+            "X_HIGH": np.inf,
+            "INIT_LOW": 0.0,
+            "INIT_HIGH": 0.0,
+            "OBS_LOW": -1.0,
+            "OBS_HIGH": 1.0,
+        }
         for name, value in extra.items():
             setattr(self, name, np.append(getattr(plant, name), np.full(n, value)))
 
@@ -35,7 +42,10 @@ class Mismatch:
 
     def step(self, x, u, psi):
         x = np.asarray(x)[..., : len(self.plant.X_LOW)]
-        x_next, nominal = self.plant.step(x, u, psi), self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi)))
+        x_next, nominal = (
+            self.plant.step(x, u, psi),
+            self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi))),
+        )
         return np.concatenate([x_next, np.tanh((x_next - nominal) / self.MISMATCH_SCALE)], axis=-1)
 
 
@@ -55,7 +65,13 @@ class Estimator:
     """
 
     def __init__(self, plant, kind=None, gain=1.0, scale=None, window=5):
-        self.plant, self.kind, self.gain, self.scale, self.window = plant, kind, gain, np.inf if scale is None else np.array(scale), window
+        self.plant, self.kind, self.gain, self.scale, self.window = (
+            plant,
+            kind,
+            gain,
+            np.inf if scale is None else np.array(scale),
+            window,
+        )
         self.reset()
 
     def reset(self):
@@ -83,7 +99,11 @@ class Estimator:
 
     def memory(self):
         """What a prediction takes, by name."""
-        return {} if self.kind is None else {"disturbance": self.disturbance, "shift": self.shift, "mismatch": self.mismatch}
+        return (
+            {}
+            if self.kind is None
+            else {"disturbance": self.disturbance, "shift": self.shift, "mismatch": self.mismatch}
+        )
 
     def update(self, x):
         """Take the state (n_x,) that the last action led to."""
@@ -112,4 +132,7 @@ class Estimator:
             predicted = self.plant.step(x, u, np.tile(nominal + half * v, (len(x), 1)))
             return np.append((predicted - x_next) / scale, prior * (v - self.shift / known))
 
-        return half * least_squares(residuals, np.clip(self.shift / known, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
+        return (
+            half
+            * least_squares(residuals, np.clip(self.shift / known, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
+        )

@@ -12,7 +12,9 @@ from envs.plant import goal_reward, sample_states
 class _PlantSpaces:
     """Spaces and observation layout that the single and the batched environment share."""
 
-    def _set_plant(self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold):
+    def _set_plant(
+        self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
+    ):
         from envs import load
 
         self.plant = load(plant, **options)
@@ -30,16 +32,24 @@ class _PlantSpaces:
         p = self.plant
         goal_box = box(p.OBS_LOW[p.GOAL_INDEX], p.OBS_HIGH[p.GOAL_INDEX])
         self._single_observation_space = gym.spaces.Dict(
-            observation=box(p.OBS_LOW, p.OBS_HIGH), achieved_goal=goal_box, desired_goal=box(p.GOAL_LOW, p.GOAL_HIGH)
+            observation=box(p.OBS_LOW, p.OBS_HIGH),
+            achieved_goal=goal_box,
+            desired_goal=box(p.GOAL_LOW, p.GOAL_HIGH),
         )
-        self._single_action_space = gym.spaces.Box(np.float32(p.U_LOW), np.float32(p.U_HIGH), dtype=np.float32)
+        self._single_action_space = gym.spaces.Box(
+            np.float32(p.U_LOW), np.float32(p.U_HIGH), dtype=np.float32
+        )
 
     def compute_reward(self, achieved_goal, desired_goal, info=None):
         """Reward, vectorised over the leading axes; equal to what `step` returned."""
         return goal_reward(self.plant, achieved_goal, desired_goal, *self.reward_shape)
 
     def _obs(self, x, goal):
-        return {"observation": x.copy(), "achieved_goal": x[..., self.plant.GOAL_INDEX], "desired_goal": goal.copy()}
+        return {
+            "observation": x.copy(),
+            "achieved_goal": x[..., self.plant.GOAL_INDEX],
+            "desired_goal": goal.copy(),
+        }
 
     def _clip(self, action, shape):
         action = np.asarray(action, dtype=np.float64)
@@ -58,7 +68,9 @@ class _PlantSpaces:
                 if name == "state" and isinstance(self.plant, Mismatch):
                     value = value[..., :n_x]
                 if value.shape not in ((n,), (*shape, n)) or not np.isfinite(value).all():
-                    raise ValueError(f"reset: {name} is {value.tolist()}; it must be finite, of shape {(*shape, n)}")
+                    raise ValueError(
+                        f"reset: {name} is {value.tolist()}; it must be finite, of shape {(*shape, n)}"
+                    )
                 if name == "state" and isinstance(self.plant, Mismatch):  # none yet
                     value = np.concatenate([value, np.zeros_like(value)], axis=-1)
                 found[name] = np.broadcast_to(value, (*shape, value.shape[-1])).copy()
@@ -75,9 +87,21 @@ class GoalEnv(_PlantSpaces, gym.Env):
 
     metadata = {"render_modes": []}
 
-    def __init__(self, plant, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None, scenario_hold="step",
-                 max_episode_steps=None, render_mode=None, **options):  # fmt: skip
-        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold)
+    def __init__(
+        self,
+        plant,
+        scenarios="robust",
+        smooth_reward=True,
+        reward_sigma2=None,
+        reward_tolerance=None,
+        scenario_hold="step",
+        max_episode_steps=None,
+        render_mode=None,
+        **options,
+    ):
+        self._set_plant(
+            plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
+        )
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
         self.observation_space, self.action_space = self._single_observation_space, self._single_action_space
 
@@ -85,8 +109,14 @@ class GoalEnv(_PlantSpaces, gym.Env):
         super().reset(seed=seed)
         given, self.t = self._options(options, ()), 0
         self.x = given["state"] if "state" in given else sample_states(self.plant, self.np_random, 1)[0]
-        self.goal = given["goal"] if "goal" in given else np.array(self.np_random.choice(self.plant.TRAIN_GOALS), dtype=np.float64)
-        self.psi = given["psi"] if "psi" in given else self.np_random.choice(self.scenarios) if self.hold else None
+        self.goal = (
+            given["goal"]
+            if "goal" in given
+            else np.array(self.np_random.choice(self.plant.TRAIN_GOALS), dtype=np.float64)
+        )
+        self.psi = (
+            given["psi"] if "psi" in given else self.np_random.choice(self.scenarios) if self.hold else None
+        )
         return self._obs(self.x, self.goal), {}
 
     def step(self, action):
@@ -108,12 +138,29 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, plant, num_envs=1, scenarios="robust", smooth_reward=True, reward_sigma2=None, reward_tolerance=None,
-                 branches=0, scenario_hold="step", max_episode_steps=None, render_mode=None, **options):  # fmt: skip
-        self._set_plant(plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold)
+    def __init__(
+        self,
+        plant,
+        num_envs=1,
+        scenarios="robust",
+        smooth_reward=True,
+        reward_sigma2=None,
+        reward_tolerance=None,
+        branches=0,
+        scenario_hold="step",
+        max_episode_steps=None,
+        render_mode=None,
+        **options,
+    ):
+        self._set_plant(
+            plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
+        )
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
-        self.single_observation_space, self.single_action_space = self._single_observation_space, self._single_action_space
+        self.single_observation_space, self.single_action_space = (
+            self._single_observation_space,
+            self._single_action_space,
+        )
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 

@@ -58,12 +58,22 @@ class Linear:
     ANGLES, PSI_NAMES, PSI_NOMINAL, MODEL_SUBSTEPS = [], (), np.zeros(0), 1
     SCENARIOS = {name: np.zeros((1, 0)) for name in ("nominal", "mpc", "robust")}
     EVAL_PSI = np.zeros((1, 0))
-    REWARD_SIGMA2, REWARD_TOLERANCE = 0.25, 0.1  # squared norm of the state; half-width of the 0/1 reward in every state
+    REWARD_SIGMA2, REWARD_TOLERANCE = (
+        0.25,
+        0.1,
+    )  # squared norm of the state; half-width of the 0/1 reward in every state
     MPC_SIGMA2 = 0.5  # exp(-l) of eq:jensen
     METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
     # what sac_her_branching.py trains with: over 90,000 parameters per network at n = 32
-    TRAINING = {"hidden": (256, 256), "total_timesteps": 500_000, "num_envs": 64, "gamma": 0.9, "learning_starts": 10_000,
-                "steps_per_update": 16, "alpha_init": 0.005}  # fmt: skip
+    TRAINING = {
+        "hidden": (256, 256),
+        "total_timesteps": 500_000,
+        "num_envs": 64,
+        "gamma": 0.9,
+        "learning_starts": 10_000,
+        "steps_per_update": 16,
+        "alpha_init": 0.005,
+    }
 
     def __init__(self, a, transform=None):
         n = len(a)
@@ -88,7 +98,10 @@ class Linear:
         self.TRAIN_GOALS = rng.uniform(0, 1, size=(1000, 1)) * rng.uniform(-1, 1, size=(1000, n))
         self.GOAL_LOW, self.GOAL_HIGH = -one, one
         held = 1 / np.abs(np.eye(n) - a).sum(axis=1)  # a goal is held by u = (I - A) g
-        self.GOAL_REACHABLE = -held.min() * one, held.min() * one  # a cube within the goals that envs.can_hold tells exactly
+        self.GOAL_REACHABLE = (
+            -held.min() * one,
+            held.min() * one,
+        )  # a cube within the goals that envs.can_hold tells exactly
         self.ERROR_SCALE = one
         self.solved = {}  # discount: P and K
 
@@ -104,7 +117,9 @@ class Linear:
     def lqr(self, gamma=1.0):
         """P and K, (n, n) each, of the discounted regulator with M = R = I."""
         if gamma not in self.solved:
-            self.solved[gamma] = discounted_lqr(self.A, self.B, np.eye(len(self.A)), np.eye(len(self.A)), gamma)
+            self.solved[gamma] = discounted_lqr(
+                self.A, self.B, np.eye(len(self.A)), np.eye(len(self.A)), gamma
+            )
         return self.solved[gamma]
 
     def held_action(self, goal):

@@ -33,7 +33,9 @@ def stepper(ode, dt, substeps=8):
     """The simulated plant: `step(x, u, psi)`, the state one sampling time later with u held, batched over the leading axes, (..., n)."""
 
     def step(x, u, psi, substeps=substeps):
-        x, u, psi = (np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi))
+        x, u, psi = (
+            np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi)
+        )
         return np.moveaxis(rk4(ode, x, u, psi, dt, substeps), 0, -1).copy()
 
     return step
@@ -44,8 +46,21 @@ def grid(*values):
     return np.array(list(itertools.product(*values)), dtype=float)
 
 
-REQUIRED = ("ENV_ID", "DT", "STATE_NAMES", "STATE_UNITS", "X_LOW", "X_HIGH", "ACTION_NAMES", "ACTION_UNITS", "U_LOW", "U_HIGH",
-            "GOAL_INDEX", "TRAIN_GOALS", "EVAL_GOAL")  # fmt: skip
+REQUIRED = (
+    "ENV_ID",
+    "DT",
+    "STATE_NAMES",
+    "STATE_UNITS",
+    "X_LOW",
+    "X_HIGH",
+    "ACTION_NAMES",
+    "ACTION_UNITS",
+    "U_LOW",
+    "U_HIGH",
+    "GOAL_INDEX",
+    "TRAIN_GOALS",
+    "EVAL_GOAL",
+)
 
 
 class Plant:
@@ -60,8 +75,10 @@ class Plant:
         missing += [] if hasattr(source, "ode") or hasattr(source, "next_state") else ["ode"]
         if missing:
             raise ValueError(f"envs/{name}.py lacks {', '.join(missing)}")
+        _check(source, name)
         self.defaults = _defaults(source)
-        _check(self)
+        _check(self, name)
+        _try_a_step(self)
 
     def __getattr__(self, name):
         if name in ("source", "defaults") or name.startswith("__"):  # not yet there, while it is copied
@@ -89,7 +106,9 @@ def _defaults(p):
     """Of every name that a plant need not have, its value."""
     given = lambda name, default: np.asarray(getattr(p, name, default), dtype=float)  # noqa: E731
     init_low, init_high = given("INIT_LOW", p.X_LOW), given("INIT_HIGH", p.X_HIGH)
-    half, index, angles = (init_high - init_low) / 2, list(p.GOAL_INDEX), list(getattr(p, "ANGLES", []))
+    with np.errstate(invalid="ignore"):  # infinite boxes are refused below
+        half, middle = (init_high - init_low) / 2, (init_low + init_high) / 2
+    index, angles = list(p.GOAL_INDEX), list(getattr(p, "ANGLES", []))
     scale = given("ERROR_SCALE", 0.05 * half[index])
     goal_low, goal_high = given("GOAL_LOW", init_low[index]), given("GOAL_HIGH", init_high[index])
     width, turning = float(np.mean(scale)), np.isin(index, angles)
@@ -99,7 +118,10 @@ def _defaults(p):
     if nominal.size <= 2:
         robust, evaluated = (grid(*(np.linspace(low, high, n) for low, high in zip(*ends))) for n in (10, 7))
     else:  # a grid would be huge
-        robust, evaluated = (np.random.default_rng(seed).uniform(*ends, size=(n, nominal.size)) for seed, n in ((0, 1000), (1, 200)))
+        robust, evaluated = (
+            np.random.default_rng(seed).uniform(*ends, size=(n, nominal.size))
+            for seed, n in ((0, 1000), (1, 200))
+        )
     few = grid(*np.transpose([nominal, *ends])) if nominal.size <= 3 else np.stack([nominal, *ends])
     few = np.concatenate([nominal[None], few[(few != nominal).any(axis=1)]])
     sets = {"nominal": nominal[None], "mpc": few, "robust": robust}
@@ -110,19 +132,43 @@ def _defaults(p):
             return error
         if hasattr(xp, "vertcat"):
             return xp.vertcat(*(1 - xp.cos(error[i]) if turn else error[i] for i, turn in enumerate(turning)))
-        return xp.stack([1 - xp.cos(error[..., i]) if turn else error[..., i] for i, turn in enumerate(turning)], -1)
+        return xp.stack(
+            [1 - xp.cos(error[..., i]) if turn else error[..., i] for i, turn in enumerate(turning)], -1
+        )
 
     def percentage_error(achieved, goal):
         error = np.where(turning, (achieved - goal + np.pi) % (2 * np.pi) - np.pi, achieved - goal)
         return (100 * np.abs(error) / np.where(turning, np.pi, half[index])).mean(-1)
 
-    values = dict(EPISODE_STEPS=50, TIME_UNIT="s", INIT_LOW=init_low, INIT_HIGH=init_high, ANGLES=[], MODEL_SUBSTEPS=4, TRAINING={})
+    values = dict(
+        EPISODE_STEPS=50,
+        TIME_UNIT="s",
+        INIT_LOW=init_low,
+        INIT_HIGH=init_high,
+        ANGLES=[],
+        MODEL_SUBSTEPS=4,
+        TRAINING={},
+    )
     values |= dict(OBS_LOW=np.full(len(half), -np.inf), OBS_HIGH=np.full(len(half), np.inf))
-    values |= dict(START=(init_low + init_high) / 2, START_NOISE=half / 10)
-    values |= dict(PSI_NAMES=tuple(f"psi_{i + 1}" for i in range(nominal.size)), PSI_NOMINAL=nominal, SCENARIOS=sets, EVAL_PSI=evaluated)
-    values |= dict(GOAL_LOW=goal_low, GOAL_HIGH=goal_high, GOAL_REACHABLE=(goal_low, goal_high), ERROR_SCALE=scale)
-    values |= dict(REWARD_SIGMA2=(width / 5) ** 2, REWARD_TOLERANCE=width / 5, MPC_SIGMA2=(2 * width) ** 2, METRIC_SIGMA2=(2 * width) ** 2)
-    benchmark = dict(horizon=20, slack_price=np.full((2, len(half)), np.inf), change_weight=np.zeros(len(p.U_LOW)))
+    values |= dict(START=middle, START_NOISE=half / 10)
+    values |= dict(
+        PSI_NAMES=tuple(f"psi_{i + 1}" for i in range(nominal.size)),
+        PSI_NOMINAL=nominal,
+        SCENARIOS=sets,
+        EVAL_PSI=evaluated,
+    )
+    values |= dict(
+        GOAL_LOW=goal_low, GOAL_HIGH=goal_high, GOAL_REACHABLE=(goal_low, goal_high), ERROR_SCALE=scale
+    )
+    values |= dict(
+        REWARD_SIGMA2=(width / 5) ** 2,
+        REWARD_TOLERANCE=width / 5,
+        MPC_SIGMA2=(2 * width) ** 2,
+        METRIC_SIGMA2=(2 * width) ** 2,
+    )
+    benchmark = dict(
+        horizon=20, slack_price=np.full((2, len(half)), np.inf), change_weight=np.zeros(len(p.U_LOW))
+    )
     values |= dict(BENCHMARK=benchmark, goal_error=goal_error, percentage_error=percentage_error)
     if hasattr(p, "ode"):
         values["step"] = stepper(p.ode, p.DT)
@@ -130,51 +176,91 @@ def _defaults(p):
         values["MODEL_SUBSTEPS"] = 1
 
         def step(x, u, psi):
-            return np.moveaxis(p.next_state(*(np.moveaxis(np.asarray(a, dtype=float), -1, 0) for a in (x, u, psi))), 0, -1)
+            return np.moveaxis(
+                p.next_state(*(np.moveaxis(np.asarray(a, dtype=float), -1, 0) for a in (x, u, psi))), 0, -1
+            )
 
         values["step"] = step
     return values
 
 
-def _check(p):
-    """Shapes, order and finite numbers of a `Plant`."""
-    n_x, n_u, n_goal, n_psi = len(p.STATE_NAMES), len(p.ACTION_NAMES), len(p.GOAL_INDEX), len(np.atleast_1d(p.PSI_NOMINAL))
-    vectors = dict.fromkeys(("X_LOW", "X_HIGH", "INIT_LOW", "INIT_HIGH", "OBS_LOW", "OBS_HIGH", "START", "START_NOISE"), n_x)
-    vectors |= dict.fromkeys(("U_LOW", "U_HIGH"), n_u) | dict.fromkeys(("EVAL_GOAL", "GOAL_LOW", "GOAL_HIGH", "ERROR_SCALE"), n_goal)
-    may_be_infinite = ("X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH")
-    shapes = {name: (np.asarray(getattr(p, name)), (n,)) for name, n in vectors.items()}
-    shapes |= {"PSI_NOMINAL": (np.asarray(p.PSI_NOMINAL), (n_psi,)), "TRAIN_GOALS": (np.asarray(p.TRAIN_GOALS), (None, n_goal))}
-    shapes |= {f"SCENARIOS[{name!r}]": (np.asarray(value), (None, n_psi)) for name, value in p.SCENARIOS.items()}
-    shapes["EVAL_PSI"] = np.asarray(p.EVAL_PSI), (None, n_psi)
-    for name, (value, shape) in shapes.items():
-        wanted = tuple(len(value) if n is None and value.ndim else n for n in shape)
-        if value.shape != wanted or not len(value) and None in shape:
-            raise ValueError(f"envs/{p.name}.py: {name} has shape {value.shape}; it must be {shape}".replace("None", "any"))
-        if np.isnan(value).any() or name not in may_be_infinite and not np.isfinite(value).all():
-            hint = "; give INIT_LOW and INIT_HIGH, where episodes start" if name in ("INIT_LOW", "INIT_HIGH") else ""
-            raise ValueError(f"envs/{p.name}.py: {name} is {value.tolist()}; it must be finite{hint}")
-    for box in ("X", "INIT", "OBS", "U", "GOAL"):
-        low, high = f"{box}_LOW", f"{box}_HIGH"
-        below, above = getattr(p, low), getattr(p, high)
-        if not (np.less if low == "U_LOW" else np.less_equal)(below, above).all():
-            raise ValueError(f"envs/{p.name}.py: {low} is {np.asarray(below).tolist()}, {high} {np.asarray(above).tolist()}; not in order")
+def _check(p, name):
+    """Shapes, order and finite numbers of the names that p has."""
+    n_x, n_u, n_goal, n_psi = (
+        len(p.STATE_NAMES),
+        len(p.ACTION_NAMES),
+        len(p.GOAL_INDEX),
+        np.size(getattr(p, "PSI_NOMINAL", [])),
+    )
+
+    def refuse(sentence):
+        raise ValueError(f"envs/{name}.py: {sentence}")
+
+    if not (np.isscalar(p.DT) and p.DT > 0):
+        refuse(f"DT is {p.DT!r}; it must be a positive number")
     for names, units, n in (("STATE_NAMES", "STATE_UNITS", n_x), ("ACTION_NAMES", "ACTION_UNITS", n_u)):
         if len(getattr(p, units)) != n:
-            raise ValueError(f"envs/{p.name}.py: {units} are {len(getattr(p, units))}, {names} {n}")
-    for name in ("GOAL_INDEX", "ANGLES"):
-        if not all(isinstance(i, (int, np.integer)) and 0 <= i < n_x for i in getattr(p, name)):
-            raise ValueError(f"envs/{p.name}.py: {name} is {getattr(p, name)}; it must be indices of the {n_x} states")
-    for name in ("nominal", "mpc", "robust"):
-        if name not in p.SCENARIOS:
-            raise ValueError(f"envs/{p.name}.py: SCENARIOS lacks {name!r}")
-    if not (np.isscalar(p.DT) and p.DT > 0):
-        raise ValueError(f"envs/{p.name}.py: DT is {p.DT!r}; it must be a positive number")
+            refuse(f"{units} are {len(getattr(p, units))}, {names} {n}")
+    for each in ("GOAL_INDEX", "ANGLES"):
+        if not all(isinstance(i, (int, np.integer)) and 0 <= i < n_x for i in getattr(p, each, ())):
+            refuse(f"{each} is {getattr(p, each)}; it must be indices of the {n_x} states")
+    lengths = dict.fromkeys(
+        ("X_LOW", "X_HIGH", "INIT_LOW", "INIT_HIGH", "OBS_LOW", "OBS_HIGH", "START", "START_NOISE"), n_x
+    )
+    lengths |= dict.fromkeys(("U_LOW", "U_HIGH"), n_u) | dict.fromkeys(
+        ("PSI_NOMINAL", "PSI_LOW", "PSI_HIGH"), n_psi
+    )
+    lengths |= dict.fromkeys(("EVAL_GOAL", "GOAL_LOW", "GOAL_HIGH", "ERROR_SCALE"), n_goal)
+    arrays = {each: (getattr(p, each), (n,)) for each, n in lengths.items() if hasattr(p, each)}
+    arrays["TRAIN_GOALS"] = p.TRAIN_GOALS, (None, n_goal)
+    arrays |= {
+        f"SCENARIOS[{each!r}]": (value, (None, n_psi)) for each, value in getattr(p, "SCENARIOS", {}).items()
+    }
+    arrays |= {"EVAL_PSI": (p.EVAL_PSI, (None, n_psi))} if hasattr(p, "EVAL_PSI") else {}
+    for each, (value, shape) in arrays.items():
+        value = np.asarray(value, dtype=float)
+        if (
+            value.ndim != len(shape)
+            or not len(value)
+            and shape[0] is None
+            or any(n not in (m, None) for n, m in zip(shape, value.shape))
+        ):
+            refuse(f"{each} has shape {value.shape}; it must be {shape}".replace("None", "any"))
+        if (
+            np.isnan(value).any()
+            or not np.isfinite(value).all()
+            and each not in ("X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH")
+        ):
+            hint = (
+                "; give INIT_LOW and INIT_HIGH, where episodes start"
+                if each in ("INIT_LOW", "INIT_HIGH")
+                else ""
+            )
+            refuse(f"{each} is {value.tolist()}; it must be finite{hint}")
+    for box in ("X", "INIT", "OBS", "U", "GOAL"):
+        low, high = (np.asarray(getattr(p, f"{box}_{end}", 0.0), dtype=float) for end in ("LOW", "HIGH"))
+        if (low > high).any() or box == "U" and (low == high).any():
+            refuse(f"{box}_LOW is {low.tolist()}, {box}_HIGH {high.tolist()}; they are not in order")
+    for each in ("nominal", "mpc", "robust"):
+        if each not in getattr(p, "SCENARIOS", [each]):
+            refuse(f"SCENARIOS lacks {each!r}")
+
+
+def _try_a_step(p):
+    """From START with the middle action."""
+    x, u, psi = (np.asarray(v, dtype=float) for v in (p.START, np.add(p.U_LOW, p.U_HIGH) / 2, p.PSI_NOMINAL))
     try:
-        x_next = np.asarray(p.step(np.asarray(p.START, float), (np.asarray(p.U_LOW) + p.U_HIGH) / 2, np.asarray(p.PSI_NOMINAL, float)))
+        found = {"ode": np.asarray(p.ode(x, u, psi, np))} if hasattr(p, "ode") else {}
+        found["step"] = np.asarray(p.step(x, u, psi))
     except Exception as error:  # whatever the plant's own equations raise
-        raise ValueError(f"envs/{p.name}.py: a step from START fails ({type(error).__name__}: {error})") from error
-    if x_next.shape != (n_x,) or not np.isfinite(x_next).all():
-        raise ValueError(f"envs/{p.name}.py: a step from START gives {x_next.tolist()}; it must be {n_x} finite numbers")
+        raise ValueError(
+            f"envs/{p.name}.py: a step from START fails ({type(error).__name__}: {error})"
+        ) from error
+    for each, value in found.items():
+        if value.shape != x.shape or not np.isfinite(value).all():
+            raise ValueError(
+                f"envs/{p.name}.py: {each} at START gives {value.tolist()}; it must be {len(x)} finite numbers"
+            )
 
 
 def reachable_goals(plant, actions=1600, steps=500):
@@ -224,7 +310,9 @@ def scenario_set(plant, name):
     Raises ValueError for a set that the plant does not have.
     """
     if name not in plant.SCENARIOS:
-        raise ValueError(f"--scenarios {name} is not a scenario set of {plant.ENV_ID}; choose one of {', '.join(plant.SCENARIOS)}")
+        raise ValueError(
+            f"--scenarios {name} is not a scenario set of {plant.ENV_ID}; choose one of {', '.join(plant.SCENARIOS)}"
+        )
     scenarios = np.asarray(plant.SCENARIOS[name])
     return np.concatenate([plant.PSI_NOMINAL[None], scenarios[(scenarios != plant.PSI_NOMINAL).any(axis=1)]])
 
@@ -264,7 +352,9 @@ def checked_state(plant, x0):
     """The measured state as a new float array (n_x,). Raises ValueError if it has another shape or an entry that is not finite."""
     x0 = np.array(x0, dtype=float)
     if x0.shape != plant.X_LOW.shape:
-        raise ValueError(f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}")
+        raise ValueError(
+            f"state has shape {x0.shape}; {plant.ENV_ID} needs {plant.X_LOW.shape}: {', '.join(plant.STATE_NAMES)}"
+        )
     if not np.isfinite(x0).all():
         raise ValueError(f"state is {np.array2string(x0, threshold=8)}; every entry must be finite")
     return x0
@@ -278,7 +368,9 @@ def checked_goal(plant, goal, horizon=None):
     n, goal = len(plant.GOAL_INDEX), np.array(goal, dtype=float)
     goal = goal.reshape(1) if goal.ndim == 0 and n == 1 else goal
     low, high = plant.GOAL_LOW, plant.GOAL_HIGH
-    shown, low_shown, high_shown = (np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high))
+    shown, low_shown, high_shown = (
+        np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high)
+    )
     if goal.shape not in ((n,), (n, horizon)):
         stages = f", or {n} for each of {horizon} stages" if horizon else ""
         raise ValueError(f"goal is {shown}; {plant.ENV_ID} needs {n} number(s){stages}")

@@ -55,15 +55,28 @@ LABELS = {
     "MX, collocation": "do-mpc 5.1.2, collocation, as published",
     "SX, collocation": "do-mpc 5.1.2, collocation, scalar expressions",
 }
-WITH_CRITIC, WITHOUT = ("l4casadi", "l4casadi, collocation", "casadi"), ("MX", "SX", "MX, collocation", "SX, collocation")
+WITH_CRITIC, WITHOUT = (
+    ("l4casadi", "l4casadi, collocation", "casadi"),
+    ("MX", "SX", "MX, collocation", "SX, collocation"),
+)
 CELLS = [("cstr", n, "random", peer) for n in (1, 2, 5) for peer in WITH_CRITIC]
 CELLS += [("cstr", 20, "none", peer) for peer in WITHOUT]
 CELLS += [("double_pendulum", n, "none", peer) for n in (25, 75) for peer in WITHOUT]
 CELLS += [("cstr", n, "trained", peer) for n in (1, 2, 5) for peer in ("l4casadi", "casadi")]
-ITERATIONS = {"ours": 50, "ours_default": deploy.Args.iterations, "ours_one": 1}  # of this repository's planner
-OURS = {"ours": "this repository", "ours_default": f"the same, {deploy.Args.iterations} iterations", "ours_one": "the same, one iteration"}
+ITERATIONS = {
+    "ours": 50,
+    "ours_default": deploy.Args.iterations,
+    "ours_one": 1,
+}  # of this repository's planner
+OURS = {
+    "ours": "this repository",
+    "ours_default": f"the same, {deploy.Args.iterations} iterations",
+    "ours_one": "the same, one iteration",
+}
 S = len(cstr.SCENARIOS["mpc"])
-BLIND = np.repeat([[0.0], [1.0]], 4, axis=1)  # price of slack beside a critic: above the upper bounds, as published
+BLIND = np.repeat(
+    [[0.0], [1.0]], 4, axis=1
+)  # price of slack beside a critic: above the upper bounds, as published
 CSTR_START = np.array([0.8, 0.4, 134.14, 130.0])  # of the authors' scripts
 
 
@@ -93,10 +106,16 @@ class Args:
 
 def load_critic(kind, seed):
     """The shipped robust critic, or its architecture with random weights: (critic, its weights for the peer)."""
-    critic, rng = deploy.load_critic(HERE / "pretrained/cstr_robust.pt", "cstr"), np.random.default_rng([seed, 6])
+    critic, rng = (
+        deploy.load_critic(HERE / "pretrained/cstr_robust.pt", "cstr"),
+        np.random.default_rng([seed, 6]),
+    )
 
     def drawn(layers):
-        return [(rng.uniform(-1, 1, w.shape) / np.sqrt(w.shape[1]), rng.uniform(-0.1, 0.1, b.shape)) for w, b in layers]
+        return [
+            (rng.uniform(-1, 1, w.shape) / np.sqrt(w.shape[1]), rng.uniform(-0.1, 0.1, b.shape))
+            for w, b in layers
+        ]
 
     if kind == "random":
         critic.actor, critic.twins = drawn(critic.actor), [drawn(twin) for twin in critic.twins]
@@ -110,38 +129,80 @@ def load_critic(kind, seed):
 def in_words(env, horizon, kind, peer, seed, tol=1e-6):
     """The literal problem for the peer."""
     plant = envs.load(env)
-    words = {"env": env, "horizon": horizon, "goal": plant.EVAL_GOAL.tolist(), "model": "collocation" if "collocation" in peer else "rk4",
-             "tol": tol, "symbols": "SX" if "SX" in peer else "MX", "degree": 2 if env == "cstr" else 3}  # fmt: skip
+    words = {
+        "env": env,
+        "horizon": horizon,
+        "goal": plant.EVAL_GOAL.tolist(),
+        "model": "collocation" if "collocation" in peer else "rk4",
+        "tol": tol,
+        "symbols": "SX" if "SX" in peer else "MX",
+        "degree": 2 if env == "cstr" else 3,
+    }
     if env == "double_pendulum":
-        return words | {"robust_horizon": 0, "sigma2": plant.MPC_SIGMA2, "change_weight": {"force": 0.0}, "u_scale": [5.0], "soft": {},
-                        "hard": {"position": (-5.0, 5.0)}, "uncertainty": dict.fromkeys(plant.PSI_NAMES, [1.0])}  # fmt: skip
-    words |= {"robust_horizon": 1, "u_scale": [100.0, 2000.0], "uncertainty": {"alpha": [1.0, 0.95, 1.05], "beta": [1.0, 0.9, 1.1]}}
-    if kind == "none":  # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 sums it as literal.py does
-        return words | {"sigma2": None, "change_weight": {"F": S * 0.1, "Q_dot": S * 1e-3}, "soft": {"T_R": (140.0, 100.0)},
-                        "hard": {"c_A": (0.1, 2.0), "c_B": (0.1, 2.0), "T_R": (50.0, None), "T_K": (50.0, 140.0)}}  # fmt: skip
+        return words | {
+            "robust_horizon": 0,
+            "sigma2": plant.MPC_SIGMA2,
+            "change_weight": {"force": 0.0},
+            "u_scale": [5.0],
+            "soft": {},
+            "hard": {"position": (-5.0, 5.0)},
+            "uncertainty": dict.fromkeys(plant.PSI_NAMES, [1.0]),
+        }
+    words |= {
+        "robust_horizon": 1,
+        "u_scale": [100.0, 2000.0],
+        "uncertainty": {"alpha": [1.0, 0.95, 1.05], "beta": [1.0, 0.9, 1.1]},
+    }
+    if (
+        kind == "none"
+    ):  # the newest do-mpc averages the penalty of changes over the scenarios, 4.6.5 sums it as literal.py does
+        return words | {
+            "sigma2": None,
+            "change_weight": {"F": S * 0.1, "Q_dot": S * 1e-3},
+            "soft": {"T_R": (140.0, 100.0)},
+            "hard": {"c_A": (0.1, 2.0), "c_B": (0.1, 2.0), "T_R": (50.0, None), "T_K": (50.0, 140.0)},
+        }
     soft = {name: (high, 1.0) for name, high in zip(plant.STATE_NAMES, plant.X_HIGH)}
-    return words | {"sigma2": plant.MPC_SIGMA2, "change_weight": {"F": 0.0, "Q_dot": 0.0}, "hard": {}, "soft": soft,
-                    "critic": load_critic(kind, seed)[1], "network": "casadi" if peer == "casadi" else "l4casadi"}  # fmt: skip
+    return words | {
+        "sigma2": plant.MPC_SIGMA2,
+        "change_weight": {"F": 0.0, "Q_dot": 0.0},
+        "hard": {},
+        "soft": soft,
+        "critic": load_critic(kind, seed)[1],
+        "network": "casadi" if peer == "casadi" else "l4casadi",
+    }
 
 
 def pendulum(horizon, **options):
     plant = envs.load("double_pendulum")
     costs = gm.costs(plant, "goal")
-    return gm.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], *costs, goal=plant.EVAL_GOAL, slack_price=np.inf, **options)
+    return gm.ScenarioMPC(
+        plant, horizon, plant.SCENARIOS["mpc"], *costs, goal=plant.EVAL_GOAL, slack_price=np.inf, **options
+    )
 
 
 def ours(env, horizon, kind, seed):
     """This repository's controllers, by the columns of their times."""
     if env == "double_pendulum":
         return {"ours": pendulum(horizon)}
-    options = dict(goal=cstr.EVAL_GOAL, slack_price=S * cstr.BENCHMARK["slack_price"], change_weight=S * cstr.BENCHMARK["change_weight"])
+    options = dict(
+        goal=cstr.EVAL_GOAL,
+        slack_price=S * cstr.BENCHMARK["slack_price"],
+        change_weight=S * cstr.BENCHMARK["change_weight"],
+    )
     stage = literal.squared_error(cstr)
     if kind != "none":
         critic, _ = load_critic(kind, seed)
         (mu, _, V), stage = deploy.export(critic), literal.gaussian(cstr)
-        options = dict(goal=cstr.EVAL_GOAL, slack_price=S * BLIND, value=V, policy=mu, expansion=expansion(critic))
-    return {name: deploy.ScenarioMPC(cstr, horizon, cstr.SCENARIOS["mpc"], stage, iterations=iterations, **options)
-            for name, iterations in ITERATIONS.items()}  # fmt: skip
+        options = dict(
+            goal=cstr.EVAL_GOAL, slack_price=S * BLIND, value=V, policy=mu, expansion=expansion(critic)
+        )
+    return {
+        name: deploy.ScenarioMPC(
+            cstr, horizon, cstr.SCENARIOS["mpc"], stage, iterations=iterations, **options
+        )
+        for name, iterations in ITERATIONS.items()
+    }
 
 
 def reference(env, horizon, kind, seed):
@@ -150,19 +211,33 @@ def reference(env, horizon, kind, seed):
     if env == "double_pendulum":
         return pendulum(horizon, **options), lambda x0: 0.0
     stage, terminal = literal.squared_error(cstr), literal.squared_error(cstr)
-    options |= dict(goal=cstr.EVAL_GOAL, slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"])
+    options |= dict(
+        goal=cstr.EVAL_GOAL,
+        slack_price=cstr.BENCHMARK["slack_price"],
+        change_weight=cstr.BENCHMARK["change_weight"],
+    )
     if kind != "none":
-        stage, terminal = literal.gaussian(cstr), literal.negative(deploy.export(load_critic(kind, seed)[0])[2])
+        stage, terminal = (
+            literal.gaussian(cstr),
+            literal.negative(deploy.export(load_critic(kind, seed)[0])[2]),
+        )
         options |= dict(slack_price=BLIND, change_weight=0.0)
-    return literal.LiteralMPC(cstr, horizon, cstr.SCENARIOS["mpc"], stage, terminal, **options), lambda x0: float(stage(x0, cstr.EVAL_GOAL))
+    return literal.LiteralMPC(
+        cstr, horizon, cstr.SCENARIOS["mpc"], stage, terminal, **options
+    ), lambda x0: float(stage(x0, cstr.EVAL_GOAL))
 
 
 class Peer:
     """The other process, which answers one state at a time."""
 
     def __init__(self, python, problem):
-        self.process = subprocess.Popen([str(python), "-W", "ignore", str(HERE / "peer_do_mpc.py")], text=True, stdin=subprocess.PIPE,
-                                        stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+        self.process = subprocess.Popen(
+            [str(python), "-W", "ignore", str(HERE / "peer_do_mpc.py")],
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
         self.versions = self.ask(problem)
 
     def ask(self, message):
@@ -171,7 +246,9 @@ class Peer:
             self.process.stdin.flush()
             return json.loads(self.process.stdout.readline())
         except (BrokenPipeError, json.JSONDecodeError):
-            raise RuntimeError(f"the peer's process stopped: {self.process.communicate()[1][-3000:]}") from None
+            raise RuntimeError(
+                f"the peer's process stopped: {self.process.communicate()[1][-3000:]}"
+            ) from None
 
     def close(self):
         self.process.stdin.close()
@@ -181,7 +258,10 @@ class Peer:
 def same_optimum(cell, x0):
     """Relative difference of the first solves' objectives, both from the start state held; empty if one failed."""
     env, horizon, kind, peer, python, *_, seed, _ = cell
-    (mpc, beside), other = reference(env, horizon, kind, seed), Peer(python, in_words(env, horizon, kind, peer, seed, tol=1e-9))
+    (mpc, beside), other = (
+        reference(env, horizon, kind, seed),
+        Peer(python, in_words(env, horizon, kind, peer, seed, tol=1e-9)),
+    )
     theirs = other.ask({"x": x0.tolist(), "new": True})
     other.close()
     mpc.make_step(x0)
@@ -193,10 +273,14 @@ def same_optimum(cell, x0):
 def summary(name, steps):
     """Columns of one side: times in ms, iterations, statuses of all steps as JSON."""
     times, iterations = (np.array([step[key] for step in steps]) for key in ("ms", "iterations"))
-    return {f"{name}_ms_median": round(np.median(times), 3), f"{name}_ms_p95": round(np.quantile(times, 0.95), 3),
-            f"{name}_ms_max": round(times.max(), 3), f"{name}_iterations": np.median(iterations),
-            f"{name}_failed": sum(not step["success"] for step in steps),
-            f"{name}_status": json.dumps(Counter(step["status"] for step in steps))}  # fmt: skip
+    return {
+        f"{name}_ms_median": round(np.median(times), 3),
+        f"{name}_ms_p95": round(np.quantile(times, 0.95), 3),
+        f"{name}_ms_max": round(times.max(), 3),
+        f"{name}_iterations": np.median(iterations),
+        f"{name}_failed": sum(not step["success"] for step in steps),
+        f"{name}_status": json.dumps(Counter(step["status"] for step in steps)),
+    }
 
 
 def outcome(stats):
@@ -204,7 +288,10 @@ def outcome(stats):
     found = {"ms": stats["wall_ms"], "iterations": stats["iterations"]}
     if "status" in stats:  # IPOPT
         return found | {"success": stats["success"], "status": stats["status"]}
-    return found | {"success": not stats["fell_back"] and stats["stop"] != "unsolved", "status": stats.get("stop", stats["rung"])}
+    return found | {
+        "success": not stats["fell_back"] and stats["stop"] != "unsolved",
+        "status": stats.get("stop", stats["rung"]),
+    }
 
 
 def measure(cell):
@@ -238,7 +325,15 @@ def measure(cell):
             y = plant.step(y, np.clip(theirs[-1]["u"], plant.U_LOW, plant.U_HIGH), psi[i])
     if other is not None:
         other.close()
-    row = {"env": env, "horizon": horizon, "critic": kind, "peer": LABELS[peer], "starts": starts, "steps": steps, "same_optimum": same}
+    row = {
+        "env": env,
+        "horizon": horizon,
+        "critic": kind,
+        "peer": LABELS[peer],
+        "starts": starts,
+        "steps": steps,
+        "same_optimum": same,
+    }
     row |= summary("ours", log["ours"])
     for name in ("ours_default", "ours_one"):
         columns = summary(name, log[name]) if name in log else {}
@@ -247,7 +342,11 @@ def measure(cell):
         row |= summary("peer", theirs)
     else:
         row |= {key: "" for key in summary("peer", log["ours"])} | {"peer_status": "not installed"}
-    for ratio, name in (("ratio_of_medians", "ours"), ("ratio_default", "ours_default"), ("ratio_one", "ours_one")):
+    for ratio, name in (
+        ("ratio_of_medians", "ours"),
+        ("ratio_default", "ours_default"),
+        ("ratio_one", "ours_one"),
+    ):
         known = row["peer_failed"] == 0 and row[f"{name}_ms_median"] != ""
         row[ratio] = round(row["peer_ms_median"] / row[f"{name}_ms_median"], 2) if known else ""
     return [row | {"peer_versions": json.dumps(other.versions) if theirs else "", "machine": cells.machine()}]
@@ -255,19 +354,30 @@ def measure(cell):
 
 def table(rows):
     titles = f"{'median':>11s}{'p95':>8s}{'failed':>8s}"
-    print(f"{'':51s}{'this repository, ms':>27s}{'default':>9s}{'one':>9s}{'peer, ms':>27s}{'ratios of medians':>24s}")
-    print(f"{'problem and peer':51s}{titles}{'median':>9s}{'median':>9s}{titles}{'':>8s}{'default':>8s}{'one':>8s}  same optimum")
+    print(
+        f"{'':51s}{'this repository, ms':>27s}{'default':>9s}{'one':>9s}{'peer, ms':>27s}{'ratios of medians':>24s}"
+    )
+    print(
+        f"{'problem and peer':51s}{titles}{'median':>9s}{'median':>9s}{titles}{'':>8s}{'default':>8s}{'one':>8s}  same optimum"
+    )
 
     def number(value, width):
         return f"{float(value):{width}.1f}" if value else f"{'':{width}s}"
 
     for row in rows:
-        print(f"{row['env']} N = {row['horizon']}" + (f", {row['critic']} critic" if row["critic"] != "none" else ""))
+        print(
+            f"{row['env']} N = {row['horizon']}"
+            + (f", {row['critic']} critic" if row["critic"] != "none" else "")
+        )
         mine = number(row["ours_ms_median"], 11) + number(row["ours_ms_p95"], 8) + f"{row['ours_failed']:>8s}"
         mine += number(row["ours_default_ms_median"], 9) + number(row["ours_one_ms_median"], 9)
         peer = f"{'not installed':>27s}"
         if row["peer_ms_median"]:
-            peer = number(row["peer_ms_median"], 11) + number(row["peer_ms_p95"], 8) + f"{row['peer_failed']:>8s}"
+            peer = (
+                number(row["peer_ms_median"], 11)
+                + number(row["peer_ms_p95"], 8)
+                + f"{row['peer_failed']:>8s}"
+            )
         ratios = "".join(number(row[key], 8) for key in ("ratio_of_medians", "ratio_default", "ratio_one"))
         print(f"    {row['peer']:47s}{mine}{peer}{ratios}  {row['same_optimum']}")
 
@@ -277,7 +387,13 @@ def plot(rows, path):
     critics = {"random": ", random critic", "trained": ", trained critic", "none": ""}
     groups = {}
     for row in rows:
-        name = "reactor, RL+MPC" if row["critic"] != "none" else "reactor, robust MPC" if row["env"] == "cstr" else "pendulum"
+        name = (
+            "reactor, RL+MPC"
+            if row["critic"] != "none"
+            else "reactor, robust MPC"
+            if row["env"] == "cstr"
+            else "pendulum"
+        )
         groups.setdefault(f"{name}, N = {row['horizon']}{critics[row['critic']]}", []).append(row)
     fig, ax = plt.subplots(figsize=(9, 0.21 * (len(rows) + 4 * len(groups)) + 1), layout="constrained")
     y, ticks = 0, []
@@ -286,7 +402,9 @@ def plot(rows, path):
         nonlocal y
         ticks.append((y, text))
         if row[f"{side}_ms_median"]:
-            median, p95, failed = (float(row.get(f"{side}_{key}", 0)) for key in ("ms_median", "ms_p95", "failed"))
+            median, p95, failed = (
+                float(row.get(f"{side}_{key}", 0)) for key in ("ms_median", "ms_p95", "failed")
+            )
             ax.plot([median, p95], [y, y], color=colour, lw=2.5)
             ax.plot(median, y, "o", color=colour, mec="black", mew=0.5, ms=6)
             words = f"{median:.0f} ms" if median >= 100 else f"{median:.3g} ms"
@@ -297,7 +415,9 @@ def plot(rows, path):
         y += 1
 
     for name, mine in groups.items():
-        ax.annotate(name, (0.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9, weight="bold")
+        ax.annotate(
+            name, (0.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9, weight="bold"
+        )
         y += 1
         # this repository was timed once beside each peer: the middle one
         middle = sorted(mine, key=lambda row: float(row["ours_ms_median"]))[len(mine) // 2]
@@ -319,11 +439,20 @@ def plot(rows, path):
 
 
 def main(args):
-    cells.check(args, "benchmark_peers.csv", starts=(1, 1000), steps=(1, 1000), seed=(0, 10**9), core=(0, (os.cpu_count() or 1) - 1))
+    cells.check(
+        args,
+        "benchmark_peers.csv",
+        starts=(1, 1000),
+        steps=(1, 1000),
+        seed=(0, 10**9),
+        core=(0, (os.cpu_count() or 1) - 1),
+    )
     path = args.out / "results/benchmark_peers.csv"
     if not args.plot_only:
         todo = []
-        for env, horizon, kind, peer in [cell for cell in CELLS if not args.quick or cell[:3] == ("cstr", 1, "random")]:
+        for env, horizon, kind, peer in [
+            cell for cell in CELLS if not args.quick or cell[:3] == ("cstr", 1, "random")
+        ]:
             python = (args.peers if "l4casadi" in peer else args.peers_new).absolute() / "bin/python"
             starts = 1 if args.quick else min(args.starts, 3 if env == "cstr" and kind != "trained" else 2)
             steps = 2 if args.quick else min(args.steps, 5) if kind == "trained" else args.steps
@@ -331,7 +460,13 @@ def main(args):
         inputs = [HERE / name for name in ("benchmark_peers.py", "peer_do_mpc.py", "literal.py")]
         inputs += [
             HERE.parent / name
-            for name in ("rl_mpc_deploy.py", "goal_mpc.py", "envs/__init__.py", "envs/cstr.py", "envs/double_pendulum.py")
+            for name in (
+                "rl_mpc_deploy.py",
+                "goal_mpc.py",
+                "envs/__init__.py",
+                "envs/cstr.py",
+                "envs/double_pendulum.py",
+            )
         ]
         cells.write(cells.collect(measure, todo, 1, args.runs, inputs), path)
     rows = cells.read(path)

@@ -65,7 +65,10 @@ def iqm(values):
     low = high = float("nan")
     if len(values) > 2:
         low, high = bootstrap(
-            (values,), lambda v, axis: trim_mean(v, 0.25, axis=axis), method="percentile", rng=np.random.default_rng(0)
+            (values,),
+            lambda v, axis: trim_mean(v, 0.25, axis=axis),
+            method="percentile",
+            rng=np.random.default_rng(0),
         ).confidence_interval
     return float(trim_mean(values, 0.25)), float(low), float(high)
 
@@ -98,13 +101,27 @@ def collect(function, cells, jobs, folder, inputs):
     (a change makes every cell new).
     """
     inputs = [*inputs, *sorted([*SHARED.rglob("*.py"), *SHARED.rglob("*.c")])]
-    version = hashlib.sha256(b"".join(file if isinstance(file, bytes) else Path(file).read_bytes() for file in inputs)).digest()
-    paths = [folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells]
-    quit_at_once = dict(initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL))  # CasADi would take Ctrl-C for a failed solve
+    version = hashlib.sha256(
+        b"".join(file if isinstance(file, bytes) else Path(file).read_bytes() for file in inputs)
+    ).digest()
+    paths = [
+        folder / f"{hashlib.sha256(version + repr(cell).encode()).hexdigest()[:12]}.csv" for cell in cells
+    ]
+    quit_at_once = dict(
+        initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_DFL)
+    )  # CasADi would take Ctrl-C for a failed solve
     with ProcessPoolExecutor(jobs, **quit_at_once) as pool:
-        futures = [pool.submit(_fill, function, cell, path) for cell, path in zip(cells, paths) if not path.exists()]
+        futures = [
+            pool.submit(_fill, function, cell, path) for cell, path in zip(cells, paths) if not path.exists()
+        ]
         try:
-            for future in tqdm(as_completed(futures), initial=len(cells) - len(futures), total=len(cells), unit="cell", disable=None):
+            for future in tqdm(
+                as_completed(futures),
+                initial=len(cells) - len(futures),
+                total=len(cells),
+                unit="cell",
+                disable=None,
+            ):
                 future.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)

@@ -80,7 +80,10 @@ class Args:
 def plant_data(critic, args):
     """A trajectories.npz of RL+MPC with this critic in its loops on draws of another seed; returns its path."""
     rows = loops.collect({"data": RL_MPC | dict(critic=critic)}, args, episodes=64, seed=args.seed + 1000)
-    x, u = np.stack([loops.replay(row) for row in rows]), np.stack([json.loads(row["actions"]) for row in rows])
+    x, u = (
+        np.stack([loops.replay(row) for row in rows]),
+        np.stack([json.loads(row["actions"]) for row in rows]),
+    )
     path = args.runs / f"plant_data_{hashlib.sha256(x.tobytes() + u.tobytes()).hexdigest()[:12]}.npz"
     if not path.exists():
         np.savez_compressed(args.runs / "unfinished.npz", rl_mpc_x=x, rl_mpc_u=u)
@@ -94,7 +97,9 @@ def collect(args):
     plain = [(seed, *flags) for label, flags in settings.items() if label != PLANT_DATA for seed in seeds]
     critics = dict(zip(plain, loops.train(plain, args)))
     default = [critics[seed, *AWARE] for seed in seeds]
-    with_data = loops.train([(seed, *AWARE, "--add-plant-data", plant_data(c, args)) for seed, c in zip(seeds, default)], args)
+    with_data = loops.train(
+        [(seed, *AWARE, "--add-plant-data", plant_data(c, args)) for seed, c in zip(seeds, default)], args
+    )
     rows, variants = [], {}
     for label, flags in settings.items():
         paths = with_data if label == PLANT_DATA else [critics[seed, *flags] for seed in seeds]
@@ -102,7 +107,10 @@ def collect(args):
     for label, options in list(DEPLOYMENT.items())[: 2 if args.quick else None]:
         variants |= {(label, seed): dict(critic=path) | options for seed, path in zip(seeds, default)}
     # a critic blind to constraints is planned with at the default's slack weight, too
-    named = {f"{label} | {seed}": RL_MPC | dict(slack_weight=2.0) | options for (label, seed), options in variants.items()}
+    named = {
+        f"{label} | {seed}": RL_MPC | dict(slack_weight=2.0) | options
+        for (label, seed), options in variants.items()
+    }
     for row in loops.table(loops.collect(named, args)):
         label, seed = row["variant"].split(" | ")
         rows.append({"agent": seed} | row | {"variant": label})
@@ -112,13 +120,20 @@ def collect(args):
 def plot(rows, path):
     labels = list(dict.fromkeys(row["variant"] for row in rows))
     fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.28 * len(labels)), sharey=True, layout="constrained")
-    print(f"{'':28s}time near goal: median  5 %-ile   outside: median  5 %-ile     mean   offset   in brackets: range over critics")
+    print(
+        f"{'':28s}time near goal: median  5 %-ile   outside: median  5 %-ile     mean   offset   in brackets: range over critics"
+    )
     for position, label in enumerate(labels):
         mine, text = [row for row in rows if row["variant"] == label], f"{label:28s}"
         agents = sorted({row["agent"] for row in mine})
         for ax, key in zip(axes, MEASURES):
-            by_agent = [np.array([float(row[key]) for row in mine if row["agent"] == agent]) for agent in agents]
-            for measure, colour, marker in ((np.median, "#0072B2", "o"), (lambda v: np.quantile(v, 0.05), "#D55E00", "d")):
+            by_agent = [
+                np.array([float(row[key]) for row in mine if row["agent"] == agent]) for agent in agents
+            ]
+            for measure, colour, marker in (
+                (np.median, "#0072B2", "o"),
+                (lambda v: np.quantile(v, 0.05), "#D55E00", "d"),
+            ):
                 found, pooled = [measure(v) for v in by_agent], measure(np.concatenate(by_agent))
                 ax.plot(found, [-position] * len(found), marker, color=colour, ms=4, alpha=0.6)
                 ax.plot([pooled] * 2, [-position - 0.35, -position + 0.35], color=colour, lw=2)
@@ -130,8 +145,17 @@ def plot(rows, path):
         ax.grid(alpha=0.3)
     axes[0].set_yticks(-np.arange(len(labels)), labels)
     styles = {"median": ("#0072B2", "o"), "5th percentile": ("#D55E00", "d")}
-    handles = [plt.Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in styles.items()]
-    fig.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False, title="bar: all draws; points: each of the critics")
+    handles = [
+        plt.Line2D([], [], color=colour, marker=marker, label=label)
+        for label, (colour, marker) in styles.items()
+    ]
+    fig.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+        title="bar: all draws; points: each of the critics",
+    )
     fig.savefig(path, dpi=150)
 
 

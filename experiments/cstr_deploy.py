@@ -54,7 +54,9 @@ STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
     "ipopt": {
         "nominal MPC, N = 20, IPOPT": dict(controllers=("nominal_mpc",)) | IPOPT,
         "robust MPC, N = 20, IPOPT": ROBUST | IPOPT,
-        f"robust MPC, tuned, N = {dict(TUNED_IPOPT).get('horizon', 20)}, IPOPT": ROBUST | IPOPT | dict(benchmark=TUNED_IPOPT),
+        f"robust MPC, tuned, N = {dict(TUNED_IPOPT).get('horizon', 20)}, IPOPT": ROBUST
+        | IPOPT
+        | dict(benchmark=TUNED_IPOPT),
         "RL+MPC, constraint-aware, N = 5, IPOPT": RL_MPC | AWARE | IPOPT,
         "RL+MPC, constraint-aware, N = 5, hard, IPOPT": RL_MPC | AWARE | IPOPT | dict(constraints="hard"),
     },
@@ -69,13 +71,25 @@ STUDIES = {  # label: keywords of rl_mpc_deploy.Args and of cstr_loops.Loop
         }.items()
     },
     "branching": {
-        f"RL+MPC, constraint-aware, N = 5, robust horizon {stages}": RL_MPC | AWARE | dict(robust_horizon=stages) for stages in (0, 1, 2)
+        f"RL+MPC, constraint-aware, N = 5, robust horizon {stages}": RL_MPC
+        | AWARE
+        | dict(robust_horizon=stages)
+        for stages in (0, 1, 2)
     },
 }
-MAIN = ["robust MPC, N = 20", "robust MPC, tuned", "RL, paper's", "RL+MPC, paper's, N = 5", "RL, constraint-aware",
-        "RL+MPC, constraint-aware, N = 5"]  # fmt: skip
+MAIN = [
+    "robust MPC, N = 20",
+    "robust MPC, tuned",
+    "RL, paper's",
+    "RL+MPC, paper's, N = 5",
+    "RL, constraint-aware",
+    "RL+MPC, constraint-aware, N = 5",
+]
 KINDS = {"paper's": (), "constraint-aware": ("--constraint-weight", "3")}  # of agents, how they are trained
-MEASURES = {"time_near_goal": "time near goal [steps]", "time_outside_constraints": "time outside constraints [steps]"}
+MEASURES = {
+    "time_near_goal": "time near goal [steps]",
+    "time_outside_constraints": "time outside constraints [steps]",
+}
 
 
 @dataclass
@@ -102,11 +116,16 @@ class Args:
 def variants(args):
     if args.study != "critics":
         return STUDIES[args.study]
-    agents = [(kind, seed, flags) for kind, flags in KINDS.items() for seed in ((1,) if args.quick else (1, 2, 3))]
+    agents = [
+        (kind, seed, flags) for kind, flags in KINDS.items() for seed in ((1,) if args.quick else (1, 2, 3))
+    ]
     paths = loops.train([(seed, *flags) for _, seed, flags in agents], args)
     found = {}
     for (kind, seed, _), path in zip(agents, paths):
-        found |= {f"RL, {kind}, seed {seed}": ACTOR | dict(critic=path), f"RL+MPC, {kind}, seed {seed}": RL_MPC | dict(critic=path)}
+        found |= {
+            f"RL, {kind}, seed {seed}": ACTOR | dict(critic=path),
+            f"RL+MPC, {kind}, seed {seed}": RL_MPC | dict(critic=path),
+        }
     return found
 
 
@@ -120,7 +139,9 @@ def print_table(rows):
     measures = f"{'time near goal':>25s}{'time outside constraints':>37s}{'offset':>9s}"
     print(f"{'':48s}{measures}{'solve ms':>16s}{'iterations':>12s}{'steps':>10s}")
     titles = f"{'median':>9s}{'5 %-ile':>8s}{'worst':>8s}"
-    print(f"{'':48s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'per step':>12s}{'unsolved':>10s}")
+    print(
+        f"{'':48s}{titles}   {titles}{'mean':>9s}{'%':>9s}{'median     p95':>16s}{'per step':>12s}{'unsolved':>10s}"
+    )
     for label in dict.fromkeys(row["variant"] for row in rows):
         text = f"{label:48s}"
         for key in MEASURES:
@@ -139,11 +160,22 @@ def figure(rows, labels, path):
     colours = {row["variant"]: deploy.STYLES[row["controller"]]["color"] for row in rows}
     for ax, (key, title) in zip(axes, MEASURES.items()):
         data = {"variant": [row["variant"] for row in rows], title: [float(row[key]) for row in rows]}
-        sns.boxenplot(data, x=title, y="variant", hue="variant", palette=colours, legend=False, flier_kws={"s": 4}, ax=ax)
+        sns.boxenplot(
+            data,
+            x=title,
+            y="variant",
+            hue="variant",
+            palette=colours,
+            legend=False,
+            flier_kws={"s": 4},
+            ax=ax,
+        )
         ax.grid(axis="x", alpha=0.3)
         ax.set_ylabel("")
     draws = len({row["episode"] for row in rows})
-    fig.suptitle(f"{draws} paired draws of start state and plant; boxes hold 50, 75, 87.5 ... % of them", fontsize=10)
+    fig.suptitle(
+        f"{draws} paired draws of start state and plant; boxes hold 50, 75, 87.5 ... % of them", fontsize=10
+    )
     fig.savefig(path, dpi=150)
     plt.close(fig)
 

@@ -68,7 +68,9 @@ def plot(args):
     draws = {(row["seed"], row["episode"]) for row in rows}
     fig, axes = plt.subplots(1, 2, figsize=(10, 5.2), layout="constrained")
     for ax, title in zip(axes, ("medians", "5th percentiles")):
-        ax.set(xlabel="time outside constraints [steps], 0 is best", ylabel="time near goal [steps]", title=title)
+        ax.set(
+            xlabel="time outside constraints [steps], 0 is best", ylabel="time near goal [steps]", title=title
+        )
         ax.set_xscale("symlog", linthresh=1)
         ax.set_xlim(-120, 0.3 if title == "medians" else -5)
         ax.set_xticks([-100, -30, -10, -3, -1, 0], ["-100", "-30", "-10", "-3", "-1", "0"])
@@ -79,16 +81,36 @@ def plot(args):
         points = [summary(group) for group in groups]
         for ax, k in zip(axes, (0, 1)):
             size = 9 if len(points) == 1 else 6
-            ax.plot([p[1][k] for p in points], [p[0][k] for p in points], marker=marker, color=colour, ls=ls, ms=size, lw=1.5, label=label)
+            ax.plot(
+                [p[1][k] for p in points],
+                [p[0][k] for p in points],
+                marker=marker,
+                color=colour,
+                ls=ls,
+                ms=size,
+                lw=1.5,
+                label=label,
+            )
             for name, p in zip(names or [], points):
                 if name not in (names[0], "2", names[-1]):
                     continue
-                ax.annotate(name, (p[1][k], p[0][k]), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour)
+                ax.annotate(
+                    name,
+                    (p[1][k], p[0][k]),
+                    xytext=(4, 4),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color=colour,
+                )
         for name, ((near, near_low), (outside, outside_low)) in zip(names or [""], points):
             text = f"{label}{', slack weight ' if name else ''}{name}"
             print(f"{text:46s}{near:14.1f}{near_low:9.1f}{outside:18.1f}{outside_low:9.1f}")
 
-    oracle = [row for row in cells.read(args.out / "results/cstr_oracle.csv") if (row["seed"], row["episode"]) in draws]
+    oracle = [
+        row
+        for row in cells.read(args.out / "results/cstr_oracle.csv")
+        if (row["seed"], row["episode"]) in draws
+    ]
     by_weight = {}
     for row in oracle:
         by_weight.setdefault(row["weight"], []).append(row)
@@ -100,7 +122,11 @@ def plot(args):
             if row["variant"].rpartition(", slack weight ")[0] == label:
                 groups.setdefault(row["slack_weight"], []).append(row)
         draw(groups.values(), label, colour, marker, [f"{float(weight):g}" for weight in groups])
-    controllers = [row for row in cells.read(args.out / "results/cstr_deploy.csv") if (row["seed"], row["episode"]) in draws]
+    controllers = [
+        row
+        for row in cells.read(args.out / "results/cstr_deploy.csv")
+        if (row["seed"], row["episode"]) in draws
+    ]
     for variant, (colour, marker, label) in POINTS.items():
         draw([[row for row in controllers if row["variant"] == variant]], label, colour, marker, ls="none")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -113,10 +139,15 @@ def main(args):
     cells.check(args, "cstr_frontier.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     for needed in ("cstr_deploy", "cstr_oracle"):
         if not (args.out / f"results/{needed}.csv").exists():
-            cells.fail(f"{args.out / 'results' / needed}.csv does not exist; run python experiments/{needed}.py first")
+            cells.fail(
+                f"{args.out / 'results' / needed}.csv does not exist; run python experiments/{needed}.py first"
+            )
     if not args.plot_only:
-        variants = {f"{label}, slack weight {weight:g}": options | dict(slack_weight=weight) for label, (_, _, options) in CURVES.items()
-                    for weight in (WEIGHTS[:2] if args.quick else WEIGHTS)}  # fmt: skip
+        variants = {
+            f"{label}, slack weight {weight:g}": options | dict(slack_weight=weight)
+            for label, (_, _, options) in CURVES.items()
+            for weight in (WEIGHTS[:2] if args.quick else WEIGHTS)
+        }
         cells.write(loops.table(loops.collect(variants, args)), args.out / "results/cstr_frontier.csv")
     plot(args)
 

@@ -32,7 +32,9 @@ from envs.control.expansion import expansion
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
 # what rows depend on, read when it is imported: an edit while loops run does not file old results under new code
-INPUTS = [Path(module.__file__).read_bytes() for module in (sys.modules[__name__], literal, deploy, gm, envs, cstr)]
+INPUTS = [
+    Path(module.__file__).read_bytes() for module in (sys.modules[__name__], literal, deploy, gm, envs, cstr)
+]
 BLOCK = 25  # draws per cell
 
 
@@ -84,7 +86,9 @@ def loops(variants, episodes, seed, quick=False):
             args = deploy.Args(**{k: v for k, v in options.items() if k not in own})
             key = f"{checksum(deploy.critic_path(args))} {replace(args, critic=None)}"
             stop = min(first + BLOCK, episodes)
-            found.append(Loop(label, args, key, first, stop, **{k: v for k, v in options.items() if k in own}))
+            found.append(
+                Loop(label, args, key, first, stop, **{k: v for k, v in options.items() if k in own})
+            )
     return found
 
 
@@ -92,7 +96,9 @@ def one_start(settings):
     """RL+MPC whose planner is a `OneStart`."""
     plant, goal, critic = deploy.check(settings)
     mu, _, V = deploy.export(critic)
-    options = dict(slack_price=settings.slack_weight, iterations=settings.iterations, compile=settings.compile)
+    options = dict(
+        slack_price=settings.slack_weight, iterations=settings.iterations, compile=settings.compile
+    )
     options |= dict(goal=goal, policy=mu, expansion=expansion(critic))
     return OneStart(plant, settings.horizon, plant.SCENARIOS["mpc"], literal.gaussian(plant), V, **options)
 
@@ -100,7 +106,10 @@ def one_start(settings):
 @functools.cache
 def controller(settings, like, benchmark):
     torch.set_num_threads(1)
-    name, replaced = settings.controllers[0], {key: np.array(value) if isinstance(value, tuple) else value for key, value in benchmark}
+    name, replaced = (
+        settings.controllers[0],
+        {key: np.array(value) if isinstance(value, tuple) else value for key, value in benchmark},
+    )
     with mock.patch.dict(cstr.BENCHMARK, replaced):
         if like in KINDS:
             return literal.build_controller(name, settings, KINDS[like])
@@ -135,9 +144,13 @@ class Recorder:
     def counts(self):
         """Steps whose quadratic program was unsolved, or IPOPT's first solve; steps that ended at the limit of iterations; and the largest
         `left`, 0 where nothing is known of it."""
-        return {"unsolved": sum(stats.get("stop") == "unsolved" or not stats.get("success", True) for stats in self.log),
-                "limit": sum(stats.get("stop") == "limit" for stats in self.log),
-                "left": max((stats["left"] for stats in self.log if stats["left"] >= 0), default=0.0)}  # fmt: skip
+        return {
+            "unsolved": sum(
+                stats.get("stop") == "unsolved" or not stats.get("success", True) for stats in self.log
+            ),
+            "limit": sum(stats.get("stop") == "limit" for stats in self.log),
+            "left": max((stats["left"] for stats in self.log if stats["left"] >= 0), default=0.0),
+        }
 
 
 def shifted_plants(episodes, seed, factor):
@@ -146,7 +159,13 @@ def shifted_plants(episodes, seed, factor):
     found = []
     for episode in range(episodes):
         direction = np.random.default_rng([seed, 4, episode]).uniform(-1, 1, size=2)
-        found.append(cstr.PSI_NOMINAL + factor * direction / np.abs(direction).max() * (cstr.SCENARIOS["robust"].max(0) - cstr.PSI_NOMINAL))
+        found.append(
+            cstr.PSI_NOMINAL
+            + factor
+            * direction
+            / np.abs(direction).max()
+            * (cstr.SCENARIOS["robust"].max(0) - cstr.PSI_NOMINAL)
+        )
     return np.array(found)
 
 
@@ -170,15 +189,28 @@ def run(loop):
     if loop.shift is not None:
         psi = shifted_plants(loop.stop, args.seed, loop.shift)
     critic = deploy.critic_path(args)
-    head = {"variant": loop.variant, "controller": args.controllers[0], "horizon": mpc.horizon or 0, "slack_weight": slack_weight(mpc),
-            "critic": critic.stem if critic.parent == ROBUST.parent else critic.parent.name, "seed": args.seed}  # fmt: skip
+    head = {
+        "variant": loop.variant,
+        "controller": args.controllers[0],
+        "horizon": mpc.horizon or 0,
+        "slack_weight": slack_weight(mpc),
+        "critic": critic.stem if critic.parent == ROBUST.parent else critic.parent.name,
+        "seed": args.seed,
+    }
     rows = []
     for episode in range(loop.first, loop.stop):
         recorder = Recorder(mpc)
-        x, u, row = deploy.run_episode(recorder, cstr, starts[episode], psi[episode], np.array(args.goal or cstr.EVAL_GOAL), args.steps)
+        x, u, row = deploy.run_episode(
+            recorder, cstr, starts[episode], psi[episode], np.array(args.goal or cstr.EVAL_GOAL), args.steps
+        )
         row |= recorder.counts() | {"slack": slack(x)}
         row = {k: round(float(v), 6) if isinstance(v, float) else v for k, v in row.items()}
-        rows.append(head | {"episode": episode, "psi": json.dumps(psi[episode].tolist())} | row | {"actions": json.dumps(u.tolist())})
+        rows.append(
+            head
+            | {"episode": episode, "psi": json.dumps(psi[episode].tolist())}
+            | row
+            | {"actions": json.dumps(u.tolist())}
+        )
     return rows
 
 
@@ -200,14 +232,36 @@ def train(agents, args):
 
     def one(agent):
         seed, *flags = map(str, agent)
-        named = [flag.name if isinstance(flag, Path) else str(flag) for flag in agent[1:]]  # the same wherever the files lie
-        version = hashlib.sha256(b"".join(path.read_bytes() for path in code) + repr((named, args.quick)).encode()).hexdigest()[:8]
+        named = [
+            flag.name if isinstance(flag, Path) else str(flag) for flag in agent[1:]
+        ]  # the same wherever the files lie
+        version = hashlib.sha256(
+            b"".join(path.read_bytes() for path in code) + repr((named, args.quick)).encode()
+        ).hexdigest()[:8]
         final = args.runs / f"agents/{version}_{seed}"
         if not (final / "checkpoint.pt").exists():
-            command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--seed", seed, "--eval-every", "0", "--save-every", "0"]
-            command += ["--out", str(final / "run"), *(["--total-timesteps", "2000"] if args.quick else []), *flags]
-            subprocess.run(command, check=True, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
-            max(final.glob("run/*/checkpoint.pt"), key=lambda path: path.stat().st_mtime).replace(final / "checkpoint.pt")
+            command = [
+                sys.executable,
+                str(HERE.parent / "sac_her_branching.py"),
+                "--seed",
+                seed,
+                "--eval-every",
+                "0",
+                "--save-every",
+                "0",
+            ]
+            command += [
+                "--out",
+                str(final / "run"),
+                *(["--total-timesteps", "2000"] if args.quick else []),
+                *flags,
+            ]
+            subprocess.run(
+                command, check=True, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+            )
+            max(final.glob("run/*/checkpoint.pt"), key=lambda path: path.stat().st_mtime).replace(
+                final / "checkpoint.pt"
+            )
         return final / "checkpoint.pt"
 
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -216,7 +270,10 @@ def train(agents, args):
 
 def replay(row):
     """States (T + 1, n_x) of a closed loop, from its actions."""
-    x, psi = [deploy.draws(cstr, int(row["episode"]) + 1, int(row["seed"]))[0][int(row["episode"])]], np.array(json.loads(row["psi"]))
+    x, psi = (
+        [deploy.draws(cstr, int(row["episode"]) + 1, int(row["seed"]))[0][int(row["episode"])]],
+        np.array(json.loads(row["psi"])),
+    )
     for u in json.loads(row["actions"]):
         x.append(cstr.step(x[-1], np.array(u), psi))
     return np.array(x)

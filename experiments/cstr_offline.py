@@ -51,7 +51,10 @@ STUDIES = {  # label: arguments of sac_her_branching.py
 }
 SEPARATE = "9 scenarios, a critic for each"
 COLOURS = {"robust": "#0072B2", "nominal": "#E69F00"}  # Okabe and Ito
-PAPER = {"robust": {"robust": "about 2", "nominal": ""}, "nominal": {"robust": "about 5", "nominal": "about 5"}}
+PAPER = {
+    "robust": {"robust": "about 2", "nominal": ""},
+    "nominal": {"robust": "about 5", "nominal": "about 5"},
+}
 
 
 @dataclass
@@ -80,7 +83,9 @@ class ManyCritics(sac.TwinCritic):
     def __init__(self, pairs, **network):
         super().__init__(**network)
         twins = [sac.TwinCritic(**network) for _ in range(pairs)]
-        self.weight = torch.nn.ParameterList(torch.cat(w).detach() for w in zip(*(twin.weight for twin in twins)))
+        self.weight = torch.nn.ParameterList(
+            torch.cat(w).detach() for w in zip(*(twin.weight for twin in twins))
+        )
         self.bias = torch.nn.ParameterList(torch.cat(b).detach() for b in zip(*(twin.bias for twin in twins)))
         self.pairs = pairs
 
@@ -112,17 +117,23 @@ class ScenarioCritics(sac.SAC):
             self.critic, self.target = (ManyCritics(len(self.scenarios), **self.network) for _ in range(2))
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
-        self.optimisers["critic"] = torch.optim.Adam(self.critic.parameters(), lr=args.learning_rate, fused=True)
+        self.optimisers["critic"] = torch.optim.Adam(
+            self.critic.parameters(), lr=args.learning_rate, fused=True
+        )
 
     def update_critic(self, x, u, goal, x_next):
         pairs, batch = len(self.scenarios), len(x)
         with torch.no_grad():
             g = goal.repeat(pairs, 1)  # (pairs * B, n_goal), scenario after scenario, as everything below
-            x_next = self.plant.step(*(v.repeat(pairs, 1).numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0))
+            x_next = self.plant.step(
+                *(v.repeat(pairs, 1).numpy() for v in (x, u)), self.scenarios.repeat(batch, axis=0)
+            )
             x_next = torch.as_tensor(x_next, dtype=torch.float32)
             z = self.features(x_next, g)
             action, log_prob = self.actor.sample(z, self.generator)
-            reward = envs.goal_reward(self.plant, x_next[:, self.scaling.goal_index], g, xp=torch).view(pairs, batch)
+            reward = envs.goal_reward(self.plant, x_next[:, self.scaling.goal_index], g, xp=torch).view(
+                pairs, batch
+            )
             z, action = (v.view(pairs, batch, -1) for v in (z, action))
             value = self.target.each(z, action).amin(1) - self.log_alpha.exp() * log_prob.view(pairs, batch)
             y = reward + self.args.gamma * value
@@ -132,8 +143,14 @@ class ScenarioCritics(sac.SAC):
         loss.backward()
         self.optimisers["critic"].step()
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.target.parameters()), list(self.critic.parameters()), self.args.tau)
-        return {"losses/qf_loss": loss.detach(), "losses/qf_values": q.detach().mean(), "losses/targets": y.mean()}
+            torch._foreach_lerp_(
+                list(self.target.parameters()), list(self.critic.parameters()), self.args.tau
+            )
+        return {
+            "losses/qf_loss": loss.detach(),
+            "losses/qf_values": q.detach().mean(),
+            "losses/targets": y.mean(),
+        }
 
 
 def errors(cell):
@@ -141,7 +158,14 @@ def errors(cell):
     label, settings, seed, quick = cell
     agent, starts = (ScenarioCritics if label == SEPARATE else sac.SAC), 20 if quick else 200
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        args = sac.Args(seed=seed, out=Path(folder), eval_every=0, save_every=0, **settings, **({"total_timesteps": 3000} if quick else {}))
+        args = sac.Args(
+            seed=seed,
+            out=Path(folder),
+            eval_every=0,
+            save_every=0,
+            **settings,
+            **({"total_timesteps": 3000} if quick else {}),
+        )
         tick = time.perf_counter()
         data = torch.load(sac.main(args, agent) / "checkpoint.pt", weights_only=True)
         seconds = time.perf_counter() - tick
@@ -152,15 +176,27 @@ def errors(cell):
     for evaluation in ("nominal", "robust"):
         ape, _, held_out = evaluate(policy, cstr.EVAL_GOAL, starts, evaluation == "robust")
         for start, (error, out) in enumerate(zip(ape, held_out)):
-            rows.append({"agent": label, "seed": seed, "evaluation": evaluation, "start": start, "held_out": int(out),
-                         "ape": round(float(error), 4), "train_seconds": round(seconds, 1)})  # fmt: skip
+            rows.append(
+                {
+                    "agent": label,
+                    "seed": seed,
+                    "evaluation": evaluation,
+                    "start": start,
+                    "held_out": int(out),
+                    "ape": round(float(error), 4),
+                    "train_seconds": round(seconds, 1),
+                }
+            )
     return rows
 
 
 def collect(args):
     seeds = args.seeds or (10 if args.study == "agents" else 5)
-    jobs = [(label, settings, seed, args.quick) for label, settings in STUDIES[args.study].items()
-            for seed in range(args.seed, args.seed + (2 if args.quick else seeds))]  # fmt: skip
+    jobs = [
+        (label, settings, seed, args.quick)
+        for label, settings in STUDIES[args.study].items()
+        for seed in range(args.seed, args.seed + (2 if args.quick else seeds))
+    ]
     root = HERE.parent
     inputs = [Path(__file__), root / "sac_her_branching.py", root / "envs/__init__.py", root / "envs/cstr.py"]
     return cells.collect(errors, jobs, args.jobs, args.runs, inputs)
@@ -193,10 +229,15 @@ def plot_agents(rows, path):
         print(f"{'':16s}held out{line(by_seed(rows, agent=agent, evaluation='robust', held_out='1'))}")
     fig, ax = plt.subplots(figsize=(6.5, 3.8), layout="constrained")
     titles = {"nominal": "nominal plant", "robust": "uncertain plants"}
-    data = {"plant": [titles[row["evaluation"]] for row in rows], "agent": [f"{row['agent']} agent" for row in rows],
-            "error": [max(float(row["ape"]), 1e-3) for row in rows]}  # fmt: skip
+    data = {
+        "plant": [titles[row["evaluation"]] for row in rows],
+        "agent": [f"{row['agent']} agent" for row in rows],
+        "error": [max(float(row["ape"]), 1e-3) for row in rows],
+    }
     palette = {f"{agent} agent": colour for agent, colour in COLOURS.items()}
-    sns.boxenplot(data, x="plant", y="error", hue="agent", palette=palette, log_scale=True, flier_kws={"s": 4}, ax=ax)
+    sns.boxenplot(
+        data, x="plant", y="error", hue="agent", palette=palette, log_scale=True, flier_kws={"s": 4}, ax=ax
+    )
     ax.set(xlabel="", ylabel="absolute percentage error of $c_B$", ylim=(0.01, 200))
     ax.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     ax.grid(axis="y", alpha=0.3)
@@ -212,7 +253,9 @@ def plot_ablation(rows, path):
     for position, label in enumerate(labels):
         texts = f"{label:32s}"
         for ax, evaluation in zip(axes, ("robust", "nominal")):
-            values = np.array([float(row[f"{evaluation}_median_ape"]) for row in rows if row["agent"] == label])
+            values = np.array(
+                [float(row[f"{evaluation}_median_ape"]) for row in rows if row["agent"] == label]
+            )
             middle, low, high = cells.iqm(values)
             ax.plot([low, high], [-position, -position], color="#0072B2", lw=2)
             ax.plot(values, np.full(len(values), -position), "o", color="#999999", ms=4)
@@ -220,7 +263,9 @@ def plot_ablation(rows, path):
             ax.set(xlabel="median absolute percentage error of $c_B$", title=f"{evaluation} evaluation")
             ax.grid(axis="x", alpha=0.3)
             texts += f"{line(values):42s}"
-        print(f"{texts}{np.median([float(row['train_seconds']) for row in rows if row['agent'] == label]):7.0f}")
+        print(
+            f"{texts}{np.median([float(row['train_seconds']) for row in rows if row['agent'] == label]):7.0f}"
+        )
     for ax in axes:
         ax.set_xlim(0, None)
     axes[0].set_yticks(-np.arange(len(labels)), labels)
@@ -239,9 +284,14 @@ def main(args):
                 {
                     "agent": label,
                     "seed": seed,
-                    "train_seconds": next(r["train_seconds"] for r in rows if (r["agent"], r["seed"]) == (label, seed)),
+                    "train_seconds": next(
+                        r["train_seconds"] for r in rows if (r["agent"], r["seed"]) == (label, seed)
+                    ),
                 }
-                | {f"{e}_median_ape": round(by_seed(rows, agent=label, seed=seed, evaluation=e)[0], 4) for e in ("nominal", "robust")}
+                | {
+                    f"{e}_median_ape": round(by_seed(rows, agent=label, seed=seed, evaluation=e)[0], 4)
+                    for e in ("nominal", "robust")
+                }
                 for label, seed in dict.fromkeys((row["agent"], row["seed"]) for row in rows)
             ]
         else:

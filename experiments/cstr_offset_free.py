@@ -133,12 +133,22 @@ def run(case):
         achieved = x[1:, cstr.GOAL_INDEX]
         error = cstr.percentage_error(achieved, mpc.goal)
         late = error[args.steps // 2 :] if case.kind in ("step", "drift") else error
-        row = {"case": case.kind, "controller": loop.variant, "noise": case.noise, "gain": args.filter_gain, "seed": args.seed,
-               "episode": episode, "alpha": path[-1, 0], "beta": path[-1, 1],
-               "time_near_goal": envs.time_near_goal(cstr, achieved, mpc.goal),
-               "time_outside_constraints": envs.outside_constraints(cstr, x[1:]).sum(),
-               "offset": error[-25:].mean(), "steps_over_2_percent": int((late > 2).sum()), "solve_ms_median": np.median(times),
-               "solve_ms_p95": np.quantile(times, 0.95)}  # fmt: skip
+        row = {
+            "case": case.kind,
+            "controller": loop.variant,
+            "noise": case.noise,
+            "gain": args.filter_gain,
+            "seed": args.seed,
+            "episode": episode,
+            "alpha": path[-1, 0],
+            "beta": path[-1, 1],
+            "time_near_goal": envs.time_near_goal(cstr, achieved, mpc.goal),
+            "time_outside_constraints": envs.outside_constraints(cstr, x[1:]).sum(),
+            "offset": error[-25:].mean(),
+            "steps_over_2_percent": int((late > 2).sum()),
+            "solve_ms_median": np.median(times),
+            "solve_ms_p95": np.quantile(times, 0.95),
+        }
         row = {k: round(float(v), 5) if isinstance(v, float) else v for k, v in row.items()}
         rows.append(row | {"c_B": " ".join(f"{v:.4f}" for v in x[:, 1])})
     return rows
@@ -148,9 +158,15 @@ def cases(args):
     found, few = [], min(args.episodes, 20)
 
     def add(kind, variants, episodes, noise=0.0, gain=1.0, **options):
-        variants = {label: CONTROLLERS[label][2] if label in CONTROLLERS else SETTINGS[label] for label in variants}
-        variants = {label: keywords | options | dict(filter_gain=gain) for label, keywords in variants.items()}
-        found.extend(Case(kind, noise, loop) for loop in loops.loops(variants, episodes, args.seed, args.quick))
+        variants = {
+            label: CONTROLLERS[label][2] if label in CONTROLLERS else SETTINGS[label] for label in variants
+        }
+        variants = {
+            label: keywords | options | dict(filter_gain=gain) for label, keywords in variants.items()
+        }
+        found.extend(
+            Case(kind, noise, loop) for loop in loops.loops(variants, episodes, args.seed, args.quick)
+        )
 
     for label in CONTROLLERS:
         add("fixed", [label], args.episodes if label.startswith("robust") else 4 * args.episodes)
@@ -197,43 +213,78 @@ def number(rows, key):
 
 
 def print_loops(rows):
-    print(f"{'case':9s}{'noise':>6s}{'gain':>5s} {'controller':36s}{'draws':>6s}{'offset %: median  95 %':>24s}"
-          f"{'near goal: median  5 %':>24s}"
-          f"{'outside: median  5 %':>22s}{'steps over 2 %':>16s}{'ms':>7s}")  # fmt: skip
+    print(
+        f"{'case':9s}{'noise':>6s}{'gain':>5s} {'controller':36s}{'draws':>6s}{'offset %: median  95 %':>24s}"
+        f"{'near goal: median  5 %':>24s}"
+        f"{'outside: median  5 %':>22s}{'steps over 2 %':>16s}{'ms':>7s}"
+    )
     groups = {}
     for row in rows:
         groups.setdefault((row["case"], row["noise"], row["gain"], row["controller"]), []).append(row)
     for (case, noise, gain, controller), mine in groups.items():
-        keys = ("offset", "time_near_goal", "time_outside_constraints", "steps_over_2_percent", "solve_ms_median")
+        keys = (
+            "offset",
+            "time_near_goal",
+            "time_outside_constraints",
+            "steps_over_2_percent",
+            "solve_ms_median",
+        )
         offset, near, outside, over, ms = (number(mine, key) for key in keys)
-        print(f"{case:9s}{100 * float(noise):5.1f}%{gain:>5s} {controller:36s}{len(mine):6d}"
-              f"{np.median(offset):17.2f}{np.quantile(offset, 0.95):7.2f}"
-              f"{np.median(near):17.1f}{np.quantile(near, 0.05):7.1f}{np.median(outside):15.2f}{np.quantile(outside, 0.05):7.1f}"
-              f"{np.median(over):16.0f}{np.median(ms):7.1f}")  # fmt: skip
+        print(
+            f"{case:9s}{100 * float(noise):5.1f}%{gain:>5s} {controller:36s}{len(mine):6d}"
+            f"{np.median(offset):17.2f}{np.quantile(offset, 0.95):7.2f}"
+            f"{np.median(near):17.1f}{np.quantile(near, 0.05):7.1f}{np.median(outside):15.2f}{np.quantile(outside, 0.05):7.1f}"
+            f"{np.median(over):16.0f}{np.median(ms):7.1f}"
+        )
 
 
 def plot_loops(rows, paths, path):
     fig, axes = plt.subplots(1, 3, figsize=(13, 4.4), layout="constrained", width_ratios=(1.1, 1, 1))
 
     def offsets(case, label, noise="0.0", gain="1.0"):
-        return number([r for r in rows if (r["case"], r["controller"], r["noise"], r["gain"]) == (case, label, noise, gain)], "offset")
+        return number(
+            [
+                r
+                for r in rows
+                if (r["case"], r["controller"], r["noise"], r["gain"]) == (case, label, noise, gain)
+            ],
+            "offset",
+        )
 
     for position, (label, (colour, _, _)) in enumerate(CONTROLLERS.items()):
-        style = dict(medianprops=dict(color="black", lw=2), boxprops=dict(facecolor=colour), patch_artist=True)
+        style = dict(
+            medianprops=dict(color="black", lw=2), boxprops=dict(facecolor=colour), patch_artist=True
+        )
         found = np.maximum(offsets("fixed", label), 1e-3)
-        axes[0].boxplot(found, positions=[-position], orientation="horizontal", widths=0.6, whis=(5, 95), showfliers=False, **style)
+        axes[0].boxplot(
+            found,
+            positions=[-position],
+            orientation="horizontal",
+            widths=0.6,
+            whis=(5, 95),
+            showfliers=False,
+            **style,
+        )
     axes[0].set_yticks(-np.arange(len(CONTROLLERS)), CONTROLLERS)
-    axes[0].set(xscale="log", xlabel="offset of $c_B$ over the last 25 steps [%]", title="a fixed, unknown plant")
+    axes[0].set(
+        xscale="log", xlabel="offset of $c_B$ over the last 25 steps [%]", title="a fixed, unknown plant"
+    )
     for label in CHANGING:
         colour, dashes, _ = CONTROLLERS[label]
-        c_b = np.array([[float(v) for v in row["c_B"].split()] for row in paths if row["controller"] == label])
+        c_b = np.array(
+            [[float(v) for v in row["c_B"].split()] for row in paths if row["controller"] == label]
+        )
         if len(c_b):
             error, steps = 100 * (c_b / cstr.EVAL_GOAL[0] - 1), np.arange(c_b.shape[1]) - c_b.shape[1] // 2
             shown = steps >= -10
             axes[1].plot(steps[shown], np.median(error, 0)[shown], color=colour, ls=dashes, lw=2, label=label)
     axes[1].axhline(0, color="black", lw=1, alpha=0.5)
-    axes[1].set(xlabel=r"steps after $\beta$ falls from 1.0 to 0.9", ylabel="$c_B$ above the goal [%], median of 20 draws", ylim=(-12, 6),
-                title="the catalyst loses activity")  # fmt: skip
+    axes[1].set(
+        xlabel=r"steps after $\beta$ falls from 1.0 to 0.9",
+        ylabel="$c_B$ above the goal [%], median of 20 draws",
+        ylim=(-12, 6),
+        title="the catalyst loses activity",
+    )
     axes[1].legend(frameon=False, fontsize=7, loc="lower right")
     for label in NOISY:
         for gain, dashes, marker in zip(GAINS, ("-", "--", ":"), "osd"):
@@ -242,10 +293,19 @@ def plot_loops(rows, paths, path):
             if levels:
                 text = label if label == "RL+MPC" else f"{label}, gain {gain:g}"
                 axes[2].plot(
-                    *zip(*levels), color="black" if label == "RL+MPC" else CONTROLLERS[label][0], ls=dashes, marker=marker, ms=4, label=text
+                    *zip(*levels),
+                    color="black" if label == "RL+MPC" else CONTROLLERS[label][0],
+                    ls=dashes,
+                    marker=marker,
+                    ms=4,
+                    label=text,
                 )
-    axes[2].set(xlabel="measurement noise [% of range]", ylabel="offset of the true $c_B$ [%], median", yscale="log",
-                title="noise and the filter gain")  # fmt: skip
+    axes[2].set(
+        xlabel="measurement noise [% of range]",
+        ylabel="offset of the true $c_B$ [%], median",
+        yscale="log",
+        title="noise and the filter gain",
+    )
     if axes[2].lines:
         axes[2].legend(frameon=False, fontsize=7)
     for ax in axes:
@@ -256,14 +316,20 @@ def plot_loops(rows, paths, path):
 def plot_training(rows, path):
     fig, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
     labels = list(dict.fromkeys(row["variant"] for row in rows))
-    print(f"{'':40s}robust: median over starts                 75th percentile                           nominal")
+    print(
+        f"{'':40s}robust: median over starts                 75th percentile                           nominal"
+    )
     for position, label in enumerate(labels):
         mine = [row for row in rows if row["variant"] == label]
         text = "".join(
-            f"{cstr_offline.line(number(mine, key)):42s}" for key in ("robust_median_ape", "robust_p75_ape", "nominal_median_ape")
+            f"{cstr_offline.line(number(mine, key)):42s}"
+            for key in ("robust_median_ape", "robust_p75_ape", "nominal_median_ape")
         )
         print(f"{label:40s}{text}")
-        for key, colour, marker in (("robust_median_ape", "#0072B2", "o"), ("robust_p75_ape", "#D55E00", "d")):
+        for key, colour, marker in (
+            ("robust_median_ape", "#0072B2", "o"),
+            ("robust_p75_ape", "#D55E00", "d"),
+        ):
             found = number(mine, key)
             ax.plot(found, np.full(len(found), -position), marker, color=colour, ms=4, alpha=0.5)
             ax.plot([cells.iqm(found)[0]] * 2, [-position - 0.3, -position + 0.3], color=colour, lw=2.5)
@@ -272,9 +338,20 @@ def plot_training(rows, path):
     ax.set_xticks([0.2, 0.3, 0.5, 1, 2, 3, 5], ["0.2", "0.3", "0.5", "1", "2", "3", "5"])
     ax.minorticks_off()
     styles = {"median over starts": ("#0072B2", "o"), "75th percentile": ("#D55E00", "d")}
-    handles = [plt.Line2D([], [], color=colour, marker=marker, label=label) for label, (colour, marker) in styles.items()]
+    handles = [
+        plt.Line2D([], [], color=colour, marker=marker, label=label)
+        for label, (colour, marker) in styles.items()
+    ]
     title = "points: training seeds; bars: interquartile means"
-    fig.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False, fontsize=9, title=title, title_fontsize=9)
+    fig.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+        fontsize=9,
+        title=title,
+        title_fontsize=9,
+    )
     ax.grid(axis="x", alpha=0.3)
     fig.savefig(path, dpi=150)
 
@@ -287,14 +364,26 @@ def main(args):
     figure.parent.mkdir(parents=True, exist_ok=True)
     if args.study == "training":
         if not args.plot_only:
-            todo = [(label, variant, seed, args.quick) for label, variant in VARIANTS.items()
-                    for seed in range(args.seed, args.seed + (1 if args.quick else variant[2]))]  # fmt: skip
-            code = [Path(__file__), cstr_offline.__file__, cstr_offline.sac.__file__, envs.__file__, cstr.__file__]
+            todo = [
+                (label, variant, seed, args.quick)
+                for label, variant in VARIANTS.items()
+                for seed in range(args.seed, args.seed + (1 if args.quick else variant[2]))
+            ]
+            code = [
+                Path(__file__),
+                cstr_offline.__file__,
+                cstr_offline.sac.__file__,
+                envs.__file__,
+                cstr.__file__,
+            ]
             cells.write(plain() + cells.collect(train, todo, args.jobs, args.runs, code), table)
         return plot_training(cells.read(table), figure)
     if not args.plot_only:
         rows = cells.collect(run, cases(args), args.jobs, args.runs, [Path(__file__), *loops.INPUTS])
-        cells.write([{k: row[k] for k in ("controller", "episode", "c_B")} for row in rows if row["case"] == "step"], profile)
+        cells.write(
+            [{k: row[k] for k in ("controller", "episode", "c_B")} for row in rows if row["case"] == "step"],
+            profile,
+        )
         cells.write([{k: v for k, v in row.items() if k != "c_B"} for row in rows], table)
     rows = cells.read(table)
     print_loops(rows)

@@ -73,7 +73,9 @@ def known_plant():
     wide = {"X_LOW": -np.inf, "X_HIGH": np.inf, "INIT_LOW": 0.0, "INIT_HIGH": 2.0}
     bounds = {name: np.append(getattr(cstr, name), np.full(N_PSI, value)) for name, value in wide.items()}
     bounds["MODEL_SUBSTEPS"] = 8  # those of `cstr.step`
-    return SimpleNamespace(**{k: v for k, v in vars(cstr).items() if k.isupper()} | bounds, ode=ode, goal_error=cstr.goal_error)
+    return SimpleNamespace(
+        **{k: v for k, v in vars(cstr).items() if k.isupper()} | bounds, ode=ode, goal_error=cstr.goal_error
+    )
 
 
 class Oracle(literal.IpoptMPC):
@@ -82,7 +84,15 @@ class Oracle(literal.IpoptMPC):
     def __init__(self, steps, compile):
         price = np.repeat([1.0, 0.0], [N_X, N_PSI])  # times the weight
         stage = literal.gaussian(known_plant(), cstr.METRIC_SIGMA2)
-        super().__init__(known_plant(), steps, cstr.PSI_NOMINAL[None], stage, goal=cstr.EVAL_GOAL, slack_price=price, compile=compile)
+        super().__init__(
+            known_plant(),
+            steps,
+            cstr.PSI_NOMINAL[None],
+            stage,
+            goal=cstr.EVAL_GOAL,
+            slack_price=price,
+            compile=compile,
+        )
 
     def build_problem(self, *costs):
         """The price of slack is a parameter: a problem serves every weight."""
@@ -90,13 +100,18 @@ class Oracle(literal.IpoptMPC):
         weight, at = ca.MX.sym("weight"), self.at["slack"]  # (bounds, steps)
         slack = ca.reshape(problem["x"][at.ravel("F").tolist()], *at.shape)
         cost = ca.sum2(ca.DM(self.x_scale[np.concatenate(self.priced)]).T @ slack)
-        return problem | {"f": problem["f"] + (weight - 1) * cost, "p": ca.vertcat(problem["p"], weight)}, limits
+        return problem | {
+            "f": problem["f"] + (weight - 1) * cost,
+            "p": ca.vertcat(problem["p"], weight),
+        }, limits
 
     def optimum(self, x0, psi, weight, guess):
         """Actions (steps, n_u) that one solve from the actions `guess`, or from the held state (None), ends with; None if it fails."""
         start, solver = np.append(x0, psi), self.solvers["cold"]
         w = self.held(start) if guess is None else self.tree_guess(start, lambda t, x: guess[t])
-        result = solver(x0=w, p=np.concatenate([start, self.u_before, self.goals.ravel("F"), [weight]]), **self.limits)
+        result = solver(
+            x0=w, p=np.concatenate([start, self.u_before, self.goals.ravel("F"), [weight]]), **self.limits
+        )
         self.objective = float(result["f"])
         if not solver.stats()["success"] or not np.isfinite(self.objective):
             return None
@@ -150,10 +165,22 @@ def best(cell):
             known[weight] = near - weight * slack, near, outside, slack, f"{label}, not solved", None
         objective, near, outside, slack, label, _ = known[weight]
         found = [value for value in rows[weight] if value is not None]
-        figures = {"time_near_goal": near, "time_outside_constraints": outside, "slack": slack, "objective": objective}
-        result.append({"weight": weight, "seed": seed, "episode": episode} | {key: round(float(value), 6) for key, value in figures.items()}
-                      | {"found_from": label, "solves": len(rows[weight]),
-                       "failed": len(rows[weight]) - len(found), "agree": sum(value > objective - 1e-2 for value in found)})  # fmt: skip
+        figures = {
+            "time_near_goal": near,
+            "time_outside_constraints": outside,
+            "slack": slack,
+            "objective": objective,
+        }
+        result.append(
+            {"weight": weight, "seed": seed, "episode": episode}
+            | {key: round(float(value), 6) for key, value in figures.items()}
+            | {
+                "found_from": label,
+                "solves": len(rows[weight]),
+                "failed": len(rows[weight]) - len(found),
+                "agree": sum(value > objective - 1e-2 for value in found),
+            }
+        )
     return result
 
 
@@ -165,9 +192,15 @@ def collect(args):
     oracle(steps)  # compiled before the processes fork
     jobs = []
     for episode in range(episodes):
-        guesses = tuple((row["variant"], json.loads(row["actions"])) for row in controllers if int(row["episode"]) == episode)
+        guesses = tuple(
+            (row["variant"], json.loads(row["actions"]))
+            for row in controllers
+            if int(row["episode"]) == episode
+        )
         jobs.append((episode, args.seed, steps, FRONTIER if episode < FRONTIER_DRAWS else WEIGHTS, guesses))
-    return cells.collect(best, jobs, args.jobs, args.runs, [Path(__file__), *loops.INPUTS]), loops.table(controllers)
+    return cells.collect(best, jobs, args.jobs, args.runs, [Path(__file__), *loops.INPUTS]), loops.table(
+        controllers
+    )
 
 
 def gaps(found, controllers):
@@ -179,20 +212,35 @@ def gaps(found, controllers):
             mine = [row for row in controllers if row["variant"] == label]
             gap = {}
             for key in ("time_near_goal", "time_outside_constraints", "slack"):
-                gap[key] = np.array([float(at_best[int(row["episode"])][key]) - float(row[key]) for row in mine])
+                gap[key] = np.array(
+                    [float(at_best[int(row["episode"])][key]) - float(row[key]) for row in mine]
+                )
             objective = gap["time_near_goal"] - weight * gap["slack"]
             near, outside = gap["time_near_goal"], gap["time_outside_constraints"]
-            rows.append({"weight": weight, "variant": label, "draws": len(mine), "near_median_gap": np.median(near),
-                         "near_p95_gap": np.quantile(near, 0.95), "outside_median_gap": np.median(outside),
-                         "outside_p95_gap": np.quantile(outside, 0.95), "objective_median_gap": np.median(objective),
-                         "objective_p95_gap": np.quantile(objective, 0.95), "objective_worst_gap": objective.max(),
-                         "objective_least_gap": objective.min(), "negative": int((objective < -1e-2).sum())})  # fmt: skip
+            rows.append(
+                {
+                    "weight": weight,
+                    "variant": label,
+                    "draws": len(mine),
+                    "near_median_gap": np.median(near),
+                    "near_p95_gap": np.quantile(near, 0.95),
+                    "outside_median_gap": np.median(outside),
+                    "outside_p95_gap": np.quantile(outside, 0.95),
+                    "objective_median_gap": np.median(objective),
+                    "objective_p95_gap": np.quantile(objective, 0.95),
+                    "objective_worst_gap": objective.max(),
+                    "objective_least_gap": objective.min(),
+                    "negative": int((objective < -1e-2).sum()),
+                }
+            )
     return [{k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
 
 
 def check_goal(found, controllers, variant):
     """The goal that the repository sets itself, line by line, for one controller."""
-    (near, near_low), (outside, outside_low) = summary([row for row in controllers if row["variant"] == variant])
+    (near, near_low), (outside, outside_low) = summary(
+        [row for row in controllers if row["variant"] == variant]
+    )
     (best, best_low), (kept, kept_low) = summary([row for row in found if row["weight"] == "5.0"])
     lines = [
         ("near goal, median, of the oracle's (slack weight 5): 97 % wanted", 100 * near / best, 97.0),
@@ -201,7 +249,9 @@ def check_goal(found, controllers, variant):
         ("outside, 5th percentile, less the oracle's: -5 at least", outside_low - kept_low, -5.0),
     ]
     for benchmark in ("robust MPC, N = 20", "robust MPC, tuned"):
-        (other, other_low), (bounds, bounds_low) = summary([row for row in controllers if row["variant"] == benchmark])
+        (other, other_low), (bounds, bounds_low) = summary(
+            [row for row in controllers if row["variant"] == benchmark]
+        )
         lines += [
             (f"near goal, median, less that of {benchmark}", near - other, 0.0),
             ("the same, 5th percentile", near_low - other_low, 0.0),
@@ -218,7 +268,9 @@ def check_goal(found, controllers, variant):
 def main(args):
     cells.check(args, "cstr_oracle.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     if not (args.out / "results/cstr_deploy.csv").exists():
-        cells.fail(f"{args.out / 'results/cstr_deploy.csv'} does not exist; run python experiments/cstr_deploy.py first")
+        cells.fail(
+            f"{args.out / 'results/cstr_deploy.csv'} does not exist; run python experiments/cstr_deploy.py first"
+        )
     table, gap_table = (args.out / f"results/{name}.csv" for name in ("cstr_oracle", "cstr_oracle_gap"))
     if not args.plot_only:
         found, controllers = collect(args)
@@ -231,15 +283,30 @@ def main(args):
         mine = [row for row in rows if row["weight"] == weight]
         columns = ("time_near_goal", "time_outside_constraints", "failed", "solves")
         near, outside, failed, solves = (np.array([float(row[key]) for row in mine]) for key in columns)
-        text = "".join(f"{np.median(v):9.1f}{np.quantile(v, 0.05):8.1f}{v.min():8.1f}" for v in (near, outside))
-        print(f"{float(weight):12g}{len(mine):7d}{text}{outside.mean():8.1f}{failed.sum():8.0f}, {solves.sum():.0f}")
-    print("\ngap to the oracle: medians over draws, of the objective also 95th percentile and worst; negative: the controller was better")
+        text = "".join(
+            f"{np.median(v):9.1f}{np.quantile(v, 0.05):8.1f}{v.min():8.1f}" for v in (near, outside)
+        )
+        print(
+            f"{float(weight):12g}{len(mine):7d}{text}{outside.mean():8.1f}{failed.sum():8.0f}, {solves.sum():.0f}"
+        )
+    print(
+        "\ngap to the oracle: medians over draws, of the objective also 95th percentile and worst; negative: the controller was better"
+    )
     for row in cells.read(gap_table):
         gap = [
-            float(row[f"{key}_gap"]) for key in ("near_median", "outside_median", "objective_median", "objective_p95", "objective_worst")
+            float(row[f"{key}_gap"])
+            for key in (
+                "near_median",
+                "outside_median",
+                "objective_median",
+                "objective_p95",
+                "objective_worst",
+            )
         ]
         numbers = "near {:7.2f}  outside {:7.2f}  objective {:8.2f}{:10.1f}{:10.1f}".format(*gap)
-        print(f"weight {row['weight']:4s} {row['variant']:42s} {numbers}  negative {row['negative']} of {row['draws']}")
+        print(
+            f"weight {row['weight']:4s} {row['variant']:42s} {numbers}  negative {row['negative']} of {row['draws']}"
+        )
     controllers = cells.read(args.out / "results/cstr_deploy.csv")
     check_goal(rows, controllers, "RL+MPC, constraint-aware, N = 5")
     later = [[row for row in part if int(row["episode"]) >= UNSEEN] for part in (rows, controllers)]

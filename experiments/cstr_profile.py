@@ -29,7 +29,12 @@ CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.
     "robust_mpc": ("robust_mpc", {}, "robust MPC", {"color": "#0072B2", "ls": "-."}),
     "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", {"color": "#56B4E9"}),
     "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", {"color": "#009E73"}),
-    "rl_mpc_hard": ("rl_mpc", dict(constraints="hard"), "the same, hard constraints", {"color": "black", "ls": (0, (1, 1.5))}),
+    "rl_mpc_hard": (
+        "rl_mpc",
+        dict(constraints="hard"),
+        "the same, hard constraints",
+        {"color": "black", "ls": (0, (1, 1.5))},
+    ),
 }
 
 
@@ -61,8 +66,17 @@ def profile(name, args):
     psi, steps = np.array([args.alpha, args.beta]), 5 if args.quick else args.steps
     x, u, row = deploy.run_episode(controller, cstr, np.array(args.start), psi, controller.goal, steps)
     print(name, {key: round(float(value), 2) for key, value in row.items()})
-    head = {"controller": name, "horizon": controller.horizon or 0, "goal": args.goal, "alpha": args.alpha, "beta": args.beta}
-    return [head | {"step": t} | dict(zip(cstr.STATE_NAMES + cstr.ACTION_NAMES, [*x[t], *u[min(t, steps - 1)]])) for t in range(steps + 1)]
+    head = {
+        "controller": name,
+        "horizon": controller.horizon or 0,
+        "goal": args.goal,
+        "alpha": args.alpha,
+        "beta": args.beta,
+    }
+    return [
+        head | {"step": t} | dict(zip(cstr.STATE_NAMES + cstr.ACTION_NAMES, [*x[t], *u[min(t, steps - 1)]]))
+        for t in range(steps + 1)
+    ]
 
 
 def main(args):
@@ -78,7 +92,12 @@ def main(args):
         label += "" if name == "actor" else f", N = {mine[0]['horizon']}"
         paths[label] = values[:, :4], values[:-1, 4:], style
     (args.out / "figures").mkdir(parents=True, exist_ok=True)
-    draw_episode(cstr, paths, np.full((len(values) - 1, 1), float(rows[0]["goal"])), args.out / "figures/cstr_profile.png")
+    draw_episode(
+        cstr,
+        paths,
+        np.full((len(values) - 1, 1), float(rows[0]["goal"])),
+        args.out / "figures/cstr_profile.png",
+    )
 
 
 if __name__ == "__main__":

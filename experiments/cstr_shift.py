@@ -43,7 +43,11 @@ CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)
     "nominal MPC, N = 20": ("#999999", ":", dict(controllers=("nominal_mpc",))),
     "robust MPC, N = 20": ("#0072B2", "-.", dict(controllers=("robust_mpc",))),
     "robust MPC, tuned": ("#56B4E9", (0, (5, 1)), dict(controllers=("robust_mpc",), benchmark=TUNED)),
-    "goal-conditioned MPC, N = 5": ("#E69F00", (0, (3, 1, 1, 1)), dict(controllers=("goal_mpc",), slack_weight=2.0)),
+    "goal-conditioned MPC, N = 5": (
+        "#E69F00",
+        (0, (3, 1, 1, 1)),
+        dict(controllers=("goal_mpc",), slack_weight=2.0),
+    ),
     "RL, paper's": ("#CC79A7", "--", ACTOR | PAPER),
     "RL, constraint-aware": ("#D55E00", "--", ACTOR | AWARE),
     "RL+MPC, paper's, N = 5": ("#CC79A7", "-", RL_MPC | PAPER),
@@ -80,27 +84,49 @@ class Args:
 def plants(args):
     factors = FACTORS[::4] if args.quick else FACTORS
     variants = {
-        f"{label} | {factor:g}": options | dict(shift=factor) for label, (_, _, options) in CONTROLLERS.items() for factor in factors
+        f"{label} | {factor:g}": options | dict(shift=factor)
+        for label, (_, _, options) in CONTROLLERS.items()
+        for factor in factors
     }
     rows = loops.collect(variants, args)
-    return [{"factor": row["variant"].split(" | ")[1]} | row | {"variant": row["variant"].split(" | ")[0]} for row in loops.table(rows)]
+    return [
+        {"factor": row["variant"].split(" | ")[1]} | row | {"variant": row["variant"].split(" | ")[0]}
+        for row in loops.table(rows)
+    ]
 
 
 def plot_plants(rows, path):
     fig, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
     columns = MEASURES | {"ape_tail": "offset [%]"}
-    print(f"{'':36s}factor  " + "".join(f"{title:>36s}" for title in columns.values()) + "   median, 5th percentile (offset: 95th)")
+    print(
+        f"{'':36s}factor  "
+        + "".join(f"{title:>36s}" for title in columns.values())
+        + "   median, 5th percentile (offset: 95th)"
+    )
     for label, (colour, dashes, _) in CONTROLLERS.items():
         mine = [row for row in rows if row["variant"] == label]
         factors = sorted({float(row["factor"]) for row in mine})
-        found = {key: [np.array([float(r[key]) for r in mine if float(r["factor"]) == f]) for f in factors] for key in columns}
+        found = {
+            key: [np.array([float(r[key]) for r in mine if float(r["factor"]) == f]) for f in factors]
+            for key in columns
+        }
         for ax, key in zip(axes, columns):
-            ax.plot(factors, [np.median(v) for v in found[key]], color=colour, ls=dashes, lw=2.2, marker="o", ms=4, label=label)
+            ax.plot(
+                factors,
+                [np.median(v) for v in found[key]],
+                color=colour,
+                ls=dashes,
+                lw=2.2,
+                marker="o",
+                ms=4,
+                label=label,
+            )
             tail = [np.quantile(v, 0.95 if key == "ape_tail" else 0.05) for v in found[key]]
             ax.plot(factors, tail, color=colour, ls=dashes, lw=1, alpha=0.7)
         for i, factor in enumerate(factors):
             numbers = "".join(
-                f"{np.median(found[k][i]):26.1f}{np.quantile(found[k][i], 0.95 if k == 'ape_tail' else 0.05):10.1f}" for k in columns
+                f"{np.median(found[k][i]):26.1f}{np.quantile(found[k][i], 0.95 if k == 'ape_tail' else 0.05):10.1f}"
+                for k in columns
             )
             print(f"{label:36s}{factor:6g}  {numbers}")
     for ax, title in zip(axes, columns.values()):
@@ -110,7 +136,14 @@ def plot_plants(rows, path):
     axes[2].set_yscale("log")
     axes[2].yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     title = "thick: median; thin: 5th percentile (offset: 95th)"
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=9, title=title)
+    fig.legend(
+        *axes[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=4,
+        frameon=False,
+        fontsize=9,
+        title=title,
+    )
     fig.savefig(path, dpi=150)
 
 
@@ -148,8 +181,14 @@ def simulated_value(critic_path, x, rollouts, steps, rng):
 def critic(args):
     """A row per state visited in the closed loops of the actor and of RL+MPC at N = 5: learned and simulated value."""
     kinds = {"actor": ACTOR, "RL+MPC, N = 5": RL_MPC}
-    variants = {name: {label: kind | dict(critic=path) for label, kind in kinds.items()} for name, path in CRITICS.items()}
-    visited, rows = {name: loops.collect(own, args) for name, own in variants.items()}, []  # before torch computes: no fork after it
+    variants = {
+        name: {label: kind | dict(critic=path) for label, kind in kinds.items()}
+        for name, path in CRITICS.items()
+    }
+    visited, rows = (
+        {name: loops.collect(own, args) for name, own in variants.items()},
+        [],
+    )  # before torch computes: no fork after it
     for name, path in CRITICS.items():
         V = deploy.export(deploy.load_critic(path, "cstr"))[2]
         for label in kinds:
@@ -161,12 +200,19 @@ def critic(args):
                     found += [(int(row["episode"]), int(t), *states[t]) for t in sorted(times)]
             found = np.array(found)
             learned = np.array(V(found[:, 2:].T, cstr.EVAL_GOAL)).ravel()
-            simulated, outside = simulated_value(path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng)
+            simulated, outside = simulated_value(
+                path, found[:, 2:], 2 if args.quick else args.rollouts, 20 if args.quick else 1000, rng
+            )
             for (episode, t, *state), v, mc, out in zip(found, learned, simulated, outside):
-                rows.append({"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}
-                            | {column: round(s, 4) for column, s in zip(cstr.STATE_NAMES, state)}
-                            | {"learned": round(float(v), 4), "simulated": round(float(mc), 4),
-                               "outside": round(float(out), 4)})  # fmt: skip
+                rows.append(
+                    {"critic": name, "visited_by": label, "episode": int(episode), "step": int(t)}
+                    | {column: round(s, 4) for column, s in zip(cstr.STATE_NAMES, state)}
+                    | {
+                        "learned": round(float(v), 4),
+                        "simulated": round(float(mc), 4),
+                        "outside": round(float(out), 4),
+                    }
+                )
     return rows
 
 
@@ -176,13 +222,20 @@ def plot_critic(rows, path):
     for (ax, lower), name in zip(axes.T, CRITICS):
         for label, colour, marker in (("actor", "#D55E00", "o"), ("RL+MPC, N = 5", "#009E73", "^")):
             mine = [row for row in rows if (row["critic"], row["visited_by"]) == (name, label)]
-            learned, simulated, outside = (np.array([float(row[key]) for row in mine]) for key in ("learned", "simulated", "outside"))
-            error, found = learned - simulated, [spearmanr(learned, v).statistic for v in (simulated, outside)]
+            learned, simulated, outside = (
+                np.array([float(row[key]) for row in mine]) for key in ("learned", "simulated", "outside")
+            )
+            error, found = (
+                learned - simulated,
+                [spearmanr(learned, v).statistic for v in (simulated, outside)],
+            )
             for axis, v, correlation in zip((ax, lower), (simulated, outside), found):
                 text = f"{label}: rank correlation {correlation:.2f}"
                 axis.plot(v, learned, marker, color=colour, ms=3, alpha=0.5, label=text)
             errors = f"{error.mean():.1f}, absolute {np.abs(error).mean():.1f}"
-            print(f"{f'{name}, visited by {label}, {len(mine)} states':46s}{errors:>22s}{found[0]:31.2f}{found[1]:18.2f}")
+            print(
+                f"{f'{name}, visited by {label}, {len(mine)} states':46s}{errors:>22s}{found[0]:31.2f}{found[1]:18.2f}"
+            )
         ends = [min(ax.get_xlim()[0], ax.get_ylim()[0]), max(ax.get_xlim()[1], ax.get_ylim()[1])]
         ax.plot(ends, ends, color="black", lw=1)
         ax.set(xlabel="simulated return", ylabel="learned value", title=f"{name} critic")
@@ -195,7 +248,9 @@ def plot_critic(rows, path):
 
 def main(args):
     name = "cstr_shift" if args.study == "plants" else "cstr_shift_critic"
-    cells.check(args, f"{name}.csv", episodes=(1, 10**6), rollouts=(1, 10**4), seed=(0, 10**9), jobs=(1, 1024))
+    cells.check(
+        args, f"{name}.csv", episodes=(1, 10**6), rollouts=(1, 10**4), seed=(0, 10**9), jobs=(1, 1024)
+    )
     table, figure = args.out / f"results/{name}.csv", args.out / f"figures/{name}.png"
     if not args.plot_only:
         cells.write((plants if args.study == "plants" else critic)(args), table)

@@ -33,7 +33,9 @@ import rl_mpc_deploy as deploy
 from envs import cstr
 
 PRICE = np.minimum(len(cstr.SCENARIOS["mpc"]) * cstr.BENCHMARK["slack_price"], deploy.HARD_PRICE)
-PROBLEM = dict(goal=cstr.EVAL_GOAL, robust_horizon=1, slack_price=PRICE, change_weight=cstr.BENCHMARK["change_weight"])
+PROBLEM = dict(
+    goal=cstr.EVAL_GOAL, robust_horizon=1, slack_price=PRICE, change_weight=cstr.BENCHMARK["change_weight"]
+)
 NEAR = 50.0  # below it IPOPT counts as stuck
 
 
@@ -60,10 +62,14 @@ class GaussNewton(literal.IpoptMPC):
         oracle = super().build_solvers(compile, options)["cold"].oracle()
         w, p, f, g = (self.problem[name] for name in "xpfg")
         factor, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
-        hessian = ca.Function("nlp_hess_l", [w, p, factor, multipliers], [ca.triu(ca.hessian(factor * f, w)[0])])
+        hessian = ca.Function(
+            "nlp_hess_l", [w, p, factor, multipliers], [ca.triu(ca.hessian(factor * f, w)[0])]
+        )
         common = {"print_time": False, "show_eval_warnings": False, "hess_lag": hessian}
         ipopt = {"cold": self.cold | options, "warm": self.cold | options | self.warm}
-        return {name: ca.nlpsol(name, "ipopt", oracle, common | {"ipopt": given}) for name, given in ipopt.items()}
+        return {
+            name: ca.nlpsol(name, "ipopt", oracle, common | {"ipopt": given}) for name, given in ipopt.items()
+        }
 
 
 class Second:
@@ -88,9 +94,16 @@ class IpoptSecond(Second, literal.IpoptMPC):
     def make_step(self, x0):
         actions = self.actions(x0)
         w = self.tree_guess(x0, lambda t, x: actions[t])
-        guess_cost, self.found, self.plan = self.cost(x0, w), None, (w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"])))
+        guess_cost, self.found, self.plan = (
+            self.cost(x0, w),
+            None,
+            (w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"]))),
+        )
         u = super().make_step(x0)
-        self.stats |= {"guess_cost": guess_cost, "cost": guess_cost if self.stats["fell_back"] else self.objective}
+        self.stats |= {
+            "guess_cost": guess_cost,
+            "cost": guess_cost if self.stats["fell_back"] else self.objective,
+        }
         return u
 
 
@@ -115,13 +128,24 @@ def controller(experiment, horizon, compile):
     kind, options = EXPERIMENTS[experiment]
     if "other" in options:
         options = {"other": controller(options["other"], horizon, compile)}
-    return kind(cstr, horizon, cstr.SCENARIOS["mpc"], literal.squared_error(cstr), compile=compile, **PROBLEM, **options)
+    return kind(
+        cstr,
+        horizon,
+        cstr.SCENARIOS["mpc"],
+        literal.squared_error(cstr),
+        compile=compile,
+        **PROBLEM,
+        **options,
+    )
 
 
 def run(cell):
     """A row: one experiment on one draw."""
     experiment, seed, episode, steps, *problem = cell
-    recorder, (starts, psi) = loops.Recorder(controller(experiment, *problem)), deploy.draws(cstr, episode + 1, seed)
+    recorder, (starts, psi) = (
+        loops.Recorder(controller(experiment, *problem)),
+        deploy.draws(cstr, episode + 1, seed),
+    )
     _, _, row = deploy.run_episode(recorder, cstr, starts[episode], psi[episode], cstr.EVAL_GOAL, steps)
     gain = [stats["guess_cost"] - stats["cost"] for stats in recorder.log if "guess_cost" in stats]
     row |= {"gain": np.median(gain or [0.0]), "unsolved": recorder.counts()["unsolved"]}
@@ -130,14 +154,28 @@ def run(cell):
 
 
 def print_table(rows):
-    stuck = {row["episode"] for row in rows if row["variant"] == "IPOPT" and float(row["time_near_goal"]) < NEAR}
+    stuck = {
+        row["episode"] for row in rows if row["variant"] == "IPOPT" and float(row["time_near_goal"]) < NEAR
+    }
     draws = len({row["episode"] for row in rows})
-    print(f"medians over the {len(stuck)} of {draws} draws in which IPOPT is near the goal for less than {NEAR:g} steps")
-    columns = ("time_near_goal", "time_outside_constraints", "gain", "iterations", "solve_ms_median", "unsolved")
+    print(
+        f"medians over the {len(stuck)} of {draws} draws in which IPOPT is near the goal for less than {NEAR:g} steps"
+    )
+    columns = (
+        "time_near_goal",
+        "time_outside_constraints",
+        "gain",
+        "iterations",
+        "solve_ms_median",
+        "unsolved",
+    )
     print(f"{'':32s}" + "".join(f"{name.replace('_', ' '):>26s}" for name in columns))
     for label in EXPERIMENTS:
         mine = [row for row in rows if row["variant"] == label and row["episode"] in stuck]
-        print(f"{label:32s}" + "".join(f"{np.median([float(row[name]) for row in mine]):26.4g}" for name in columns))
+        print(
+            f"{label:32s}"
+            + "".join(f"{np.median([float(row[name]) for row in mine]):26.4g}" for name in columns)
+        )
 
 
 def main(args):
@@ -146,7 +184,11 @@ def main(args):
     if not args.plot_only:
         episodes, steps = (2, 3) if args.quick else (args.episodes, 100)
         problem = (3, False) if args.quick else (cstr.BENCHMARK["horizon"], True)
-        todo = [(label, args.seed, episode, steps, *problem) for label in EXPERIMENTS for episode in range(episodes)]
+        todo = [
+            (label, args.seed, episode, steps, *problem)
+            for label in EXPERIMENTS
+            for episode in range(episodes)
+        ]
         cells.write(cells.collect(run, todo, args.jobs, args.runs, [Path(__file__), *loops.INPUTS]), table)
     print_table(cells.read(table))
 

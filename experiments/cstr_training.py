@@ -56,7 +56,14 @@ def train(scenarios, seed, args):
     done = list(parent.glob("*/wall_seconds.txt"))
     if done:
         return done[0].parent
-    command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--scenarios", scenarios, "--seed", str(seed)]
+    command = [
+        sys.executable,
+        str(HERE.parent / "sac_her_branching.py"),
+        "--scenarios",
+        scenarios,
+        "--seed",
+        str(seed),
+    ]
     command += ["--out", str(parent)]
     if args.quick:
         command += ["--total-timesteps", "3000", "--eval-every", "1000"]
@@ -68,15 +75,30 @@ def train(scenarios, seed, args):
 
 
 def collect(args):
-    jobs = [(scenarios, seed) for seed in range(args.seed, args.seed + args.seeds) for scenarios in ("robust", "nominal")]
+    jobs = [
+        (scenarios, seed)
+        for seed in range(args.seed, args.seed + args.seeds)
+        for scenarios in ("robust", "nominal")
+    ]
     with ThreadPoolExecutor(args.jobs) as pool:
-        runs = list(tqdm(pool.map(lambda job: train(*job, args), jobs), total=len(jobs), unit="run", disable=None))
+        runs = list(
+            tqdm(pool.map(lambda job: train(*job, args), jobs), total=len(jobs), unit="run", disable=None)
+        )
     curves, finals = [], []
     for (scenarios, seed), run in zip(jobs, runs):
         with open(run / "evaluations.csv") as file:
-            rows = [{"env": "cstr", "scenarios": scenarios, "seed": seed} | row for row in csv.DictReader(file)]
+            rows = [
+                {"env": "cstr", "scenarios": scenarios, "seed": seed} | row for row in csv.DictReader(file)
+            ]
         curves += rows
-        finals.append(rows[-1] | {"wall_seconds": (run / "wall_seconds.txt").read_text(), "jobs": args.jobs, "machine": cells.machine()})
+        finals.append(
+            rows[-1]
+            | {
+                "wall_seconds": (run / "wall_seconds.txt").read_text(),
+                "jobs": args.jobs,
+                "machine": cells.machine(),
+            }
+        )
     for name, table in (("cstr_training", curves), ("cstr_training_seeds", finals)):
         path = args.out / "results" / f"{name}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,7 +118,12 @@ def plot(args):
         for scenarios, colour in COLOURS.items():
             mine = [row for row in curves if row["scenarios"] == scenarios]
             steps = sorted({int(row["step"]) for row in mine})
-            values = np.array([[float(row[f"{evaluation}_median_ape"]) for row in mine if int(row["step"]) == step] for step in steps])
+            values = np.array(
+                [
+                    [float(row[f"{evaluation}_median_ape"]) for row in mine if int(row["step"]) == step]
+                    for step in steps
+                ]
+            )
             steps = np.array(steps) / 1000
             ax.plot(
                 steps,
@@ -122,7 +149,9 @@ def plot(args):
         for key in ("robust_median_ape", "robust_held_out_median_ape", "nominal_median_ape", "wall_seconds"):
             values = np.array([float(row[key]) for row in mine])
             middle, low, high = cells.iqm(values)
-            print(f"{scenarios:8s} {key:28s} {middle:7.2f} [{low:.2f}, {high:.2f}] ({values.min():.2f} ... {values.max():.2f})")
+            print(
+                f"{scenarios:8s} {key:28s} {middle:7.2f} [{low:.2f}, {high:.2f}] ({values.min():.2f} ... {values.max():.2f})"
+            )
 
 
 def main(args):

@@ -55,8 +55,11 @@ def settings(prices, change, horizon):
 
 
 GRID = {"published": ()} | {
-    f"{prices[0]:g} per mol/l, {prices[1]:g} per degC, changes x {change:g}, N = {horizon}": settings(prices, change, horizon)
-    for prices, change, horizon in [(p, change, 20) for p in PRICES for change in CHANGES] + [(p, 0.1, 40) for p in PRICES]
+    f"{prices[0]:g} per mol/l, {prices[1]:g} per degC, changes x {change:g}, N = {horizon}": settings(
+        prices, change, horizon
+    )
+    for prices, change, horizon in [(p, change, 20) for p in PRICES for change in CHANGES]
+    + [(p, 0.1, 40) for p in PRICES]
 }
 SOLVERS = {"anytime": "", "IPOPT": "ipopt"}  # name in the table: `like` of cstr_loops.py
 TUNED = settings(prices=(1.0, 1.0), change=0.1, horizon=40)
@@ -68,18 +71,34 @@ def main(args):
     table = args.out / "results/cstr_tune.csv"
     if not args.plot_only:
         grid = dict(list(GRID.items())[:2]) if args.quick else GRID
-        variants = {f"{label} | {solver}": dict(controllers=("robust_mpc",), benchmark=benchmark, like=like)
-                    for solver, like in SOLVERS.items() for label, benchmark in grid.items()}  # fmt: skip
+        variants = {
+            f"{label} | {solver}": dict(controllers=("robust_mpc",), benchmark=benchmark, like=like)
+            for solver, like in SOLVERS.items()
+            for label, benchmark in grid.items()
+        }
         rows, found = loops.collect(variants, args), []
         for label in variants:
             columns = ("time_near_goal", "time_outside_constraints", "solve_ms_median")
             near, outside, ms = (loops.values(rows, label, column) for column in columns)
             variant, solver = label.split(" | ")
-            found.append({"solver": solver, "variant": variant, "draws": len(near),
-                          "near_median": np.median(near), "near_mean": near.mean(),
-                          "near_p5": np.quantile(near, 0.05), "outside_median": np.median(outside), "outside_mean": outside.mean(),
-                          "outside_p5": np.quantile(outside, 0.05), "score": (near + outside).mean(), "ms": np.median(ms)})  # fmt: skip
-        cells.write([{k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in found], table)
+            found.append(
+                {
+                    "solver": solver,
+                    "variant": variant,
+                    "draws": len(near),
+                    "near_median": np.median(near),
+                    "near_mean": near.mean(),
+                    "near_p5": np.quantile(near, 0.05),
+                    "outside_median": np.median(outside),
+                    "outside_mean": outside.mean(),
+                    "outside_p5": np.quantile(outside, 0.05),
+                    "score": (near + outside).mean(),
+                    "ms": np.median(ms),
+                }
+            )
+        cells.write(
+            [{k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in found], table
+        )
     for row in sorted(cells.read(table), key=lambda row: -float(row["score"])):
         head = f"{row.pop('solver'):8s}{row.pop('variant'):52s}"
         print(head, *(f"{key} {float(value):.1f}" for key, value in row.items()), sep="  ")

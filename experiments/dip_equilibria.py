@@ -45,7 +45,9 @@ class Args:
 def collect(args):
     hold, episodes = (4, 1) if args.quick else (args.hold, args.episodes)
     settings = gm.Args(objective="goal", sigma2=0.5, horizon=3 if args.quick else 35, compile=not args.quick)
-    goals = gm.goal_schedule(plant, [f"{name}@{i * hold}" for i, name in enumerate(args.goals)], hold * len(args.goals))
+    goals = gm.goal_schedule(
+        plant, [f"{name}@{i * hold}" for i, name in enumerate(args.goals)], hold * len(args.goals)
+    )
     mpc, rows = gm.build_controller(settings), []
     for seed in range(args.seed, args.seed + episodes):
         x0, psi = gm.start_and_plant(plant, seed, random_plant=False)
@@ -53,15 +55,26 @@ def collect(args):
         for i, name in enumerate(args.goals):
             part = slice(i * hold, (i + 1) * hold)
             row = gm.summary(plant, x[i * hold : (i + 1) * hold + 1], u[part], goals[part], log[part])
-            near = gm.envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=plant.METRIC_SIGMA2)[part]
+            near = gm.envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goals, sigma2=plant.METRIC_SIGMA2)[
+                part
+            ]
             row.pop("action_total_variation")  # is that of a whole episode
             reached = int(np.argmax(near > 0.9)) if near.max() > 0.9 else hold
-            rows.append({"seed": seed, "equilibrium": name, "steps_to_reach": reached, "near_last_20": round(near[-20:].mean(), 6)} | row)
+            rows.append(
+                {
+                    "seed": seed,
+                    "equilibrium": name,
+                    "steps_to_reach": reached,
+                    "near_last_20": round(near[-20:].mean(), 6),
+                }
+                | row
+            )
         if seed == args.seed:
             names = [*plant.STATE_NAMES, *plant.ACTION_NAMES, "goal_1", "goal_2"]
             values = np.hstack([x, np.vstack([u, u[-1:]]), np.vstack([goals[:1], goals])])
             gm.write_csv(
-                [{"step": t} | dict(zip(names, row)) for t, row in enumerate(values.tolist())], args.out / "results/dip_profile.csv"
+                [{"step": t} | dict(zip(names, row)) for t, row in enumerate(values.tolist())],
+                args.out / "results/dip_profile.csv",
             )
             (args.out / "figures").mkdir(exist_ok=True)
             plant.animate(x, u, predicted, goals, args.out / "figures/dip_profile.gif")
@@ -76,14 +89,22 @@ def plot(args):
     draw_episode(plant, closed_loop, values[1:, 7:], args.out / "figures/dip_profile.png")
     with open(args.out / "results/dip_equilibria.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    print(f"{'goal':10s}{'steps to reach it: median [max]':>34s}{'near over the last 20: median [min]':>38s}"
-          f"{'ms median':>11s}{'p95':>8s}{'worst':>8s}{'failed':>8s}")  # fmt: skip
+    print(
+        f"{'goal':10s}{'steps to reach it: median [max]':>34s}{'near over the last 20: median [min]':>38s}"
+        f"{'ms median':>11s}{'p95':>8s}{'worst':>8s}{'failed':>8s}"
+    )
     for goal in dict.fromkeys(row["equilibrium"] for row in rows):
-        column = {key: np.array([float(row[key]) for row in rows if row["equilibrium"] == goal]) for key in rows[0] if key != "equilibrium"}
+        column = {
+            key: np.array([float(row[key]) for row in rows if row["equilibrium"] == goal])
+            for key in rows[0]
+            if key != "equilibrium"
+        }
         reach, near = column["steps_to_reach"], column["near_last_20"]
-        print(f"{goal:10s}{np.median(reach):26.0f} [{reach.max():5.0f}]{np.median(near):31.3f} [{near.min():.2f}]"
-              f"{np.median(column['solve_ms_median']):11.1f}{np.median(column['solve_ms_p95']):8.1f}{column['solve_ms_max'].max():8.0f}"
-              f"{column['solver_failures'].sum():8.0f}")  # fmt: skip
+        print(
+            f"{goal:10s}{np.median(reach):26.0f} [{reach.max():5.0f}]{np.median(near):31.3f} [{near.min():.2f}]"
+            f"{np.median(column['solve_ms_median']):11.1f}{np.median(column['solve_ms_p95']):8.1f}{column['solve_ms_max'].max():8.0f}"
+            f"{column['solver_failures'].sum():8.0f}"
+        )
 
 
 def main(args):

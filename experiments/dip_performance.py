@@ -72,8 +72,17 @@ def run_cell(cell):
     for seed in range(settings.seed, settings.seed + settings.episodes):
         x0, psi = gm.start_and_plant(double_pendulum, seed, random_plant=False)
         x, u, _, log = gm.simulate(mpc, x0, psi, goals)
-        head = {"env": settings.env, "objective": settings.objective, "horizon": settings.horizon, "guide_horizon": guide_horizon}
-        rows.append(head | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)} | gm.summary(double_pendulum, x, u, goals, log))
+        head = {
+            "env": settings.env,
+            "objective": settings.objective,
+            "horizon": settings.horizon,
+            "guide_horizon": guide_horizon,
+        }
+        rows.append(
+            head
+            | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)}
+            | gm.summary(double_pendulum, x, u, goals, log)
+        )
     return rows
 
 
@@ -82,41 +91,80 @@ def collect(args):
     for objective, horizon, guide in CELLS:
         settings = gm.Args(objective=objective, horizon=horizon, episodes=args.episodes, seed=args.seed)
         if args.quick:
-            settings, guide = replace(settings, horizon=horizon // 25, episodes=2, steps=5, compile=False), guide // 25
+            settings, guide = (
+                replace(settings, horizon=horizon // 25, episodes=2, steps=5, compile=False),
+                guide // 25,
+            )
         work.append((settings, guide))
     inputs = [__file__, gm.__file__, gm.envs.__file__, double_pendulum.__file__]
-    cells.write(cells.collect(run_cell, work, args.jobs, args.runs, inputs), args.out / "results/dip_performance.csv")
+    cells.write(
+        cells.collect(run_cell, work, args.jobs, args.runs, inputs), args.out / "results/dip_performance.csv"
+    )
 
 
 def plot(args):
     rows = cells.read(args.out / "results/dip_performance.csv")
-    panels = {"time_near_goal": "time near goal [steps]", "action_total_variation": "action total variation [N]"}
+    panels = {
+        "time_near_goal": "time near goal [steps]",
+        "action_total_variation": "action total variation [N]",
+    }
     columns = list(dict.fromkeys((row["horizon"], row["guide_horizon"]) for row in rows))
     variation = {}  # (objective, column): median
     fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
-    print(f"{'objective':10s}{'N':>5s}{'guide':>6s}{'near goal: median [min, max]':>32s}{'action TV: median [min, max]':>32s}"
-          f"{'ms median':>11s}{'p95':>8s}{'worst':>9s}{'failed':>8s}")  # fmt: skip
+    print(
+        f"{'objective':10s}{'N':>5s}{'guide':>6s}{'near goal: median [min, max]':>32s}{'action TV: median [min, max]':>32s}"
+        f"{'ms median':>11s}{'p95':>8s}{'worst':>9s}{'failed':>8s}"
+    )
     for objective, colour in COLOURS.items():
         for position, (horizon, guide) in enumerate(columns):
-            mine = [row for row in rows if (row["objective"], row["horizon"], row["guide_horizon"]) == (objective, horizon, guide)]
-            column = {key: np.array([float(row[key]) for row in mine]) for key in mine[0] if key not in ("env", "objective")}
+            mine = [
+                row
+                for row in rows
+                if (row["objective"], row["horizon"], row["guide_horizon"]) == (objective, horizon, guide)
+            ]
+            column = {
+                key: np.array([float(row[key]) for row in mine])
+                for key in mine[0]
+                if key not in ("env", "objective")
+            }
             at = position + 0.25 * (list(COLOURS).index(objective) - 1)
             line = f"{objective:10s}{horizon:>5s}{guide:>6s}"
             for ax, key in zip(axes, panels):
                 values = column[key]
                 jitter = np.random.default_rng(0).uniform(-0.06, 0.06, len(values))
                 ax.plot(at + jitter, values, MARKERS[objective], color=colour, ms=4, alpha=0.5)
-                ax.plot([at - 0.1, at + 0.1], [np.median(values)] * 2, color=colour, lw=3, label=objective if not position else None)
+                ax.plot(
+                    [at - 0.1, at + 0.1],
+                    [np.median(values)] * 2,
+                    color=colour,
+                    lw=3,
+                    label=objective if not position else None,
+                )
                 line += f"{np.median(values):16.1f} [{values.min():5.1f}, {values.max():5.1f}]"
             variation[objective, position] = np.median(column["action_total_variation"])
-            times = (np.median(column["solve_ms_median"]), np.median(column["solve_ms_p95"]), column["solve_ms_max"].max())
-            print(f"{line}{times[0]:11.1f}{times[1]:8.1f}{times[2]:9.0f}{column['solver_failures'].sum():8.0f}")
-    fall = {objective: 1 - variation[objective, 2] / variation[objective, 0] for objective in ("quadratic", "goal")}
-    print(f"expert's variation in the second column: {variation['expert', 1] / variation['quadratic', 1]:.2f} of the quadratic agent's, "
-          f"{variation['expert', 1] / variation['goal', 1]:.2f} of the goal-conditioned agent's; "
-          f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}")  # fmt: skip
-    guesses = {"0": "start held"} | {guide: f"closed loop, N = {guide}" for _, guide in columns if guide != "0"}
-    axes[1].set_xticks(range(len(columns)), [f"N = {horizon}\nfirst guess:\n{guesses[guide]}" for horizon, guide in columns])
+            times = (
+                np.median(column["solve_ms_median"]),
+                np.median(column["solve_ms_p95"]),
+                column["solve_ms_max"].max(),
+            )
+            print(
+                f"{line}{times[0]:11.1f}{times[1]:8.1f}{times[2]:9.0f}{column['solver_failures'].sum():8.0f}"
+            )
+    fall = {
+        objective: 1 - variation[objective, 2] / variation[objective, 0]
+        for objective in ("quadratic", "goal")
+    }
+    print(
+        f"expert's variation in the second column: {variation['expert', 1] / variation['quadratic', 1]:.2f} of the quadratic agent's, "
+        f"{variation['expert', 1] / variation['goal', 1]:.2f} of the goal-conditioned agent's; "
+        f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}"
+    )
+    guesses = {"0": "start held"} | {
+        guide: f"closed loop, N = {guide}" for _, guide in columns if guide != "0"
+    }
+    axes[1].set_xticks(
+        range(len(columns)), [f"N = {horizon}\nfirst guess:\n{guesses[guide]}" for horizon, guide in columns]
+    )
     for ax, title in zip(axes, panels.values()):
         ax.set_ylabel(title)
         ax.set_ylim(bottom=0)

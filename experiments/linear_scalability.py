@@ -44,7 +44,14 @@ MEASURES = {
     "constraint_violation": "constraint\nviolation",
 }
 BASE = dict(
-    horizon=10, control_horizon=None, gamma=1.0, steps=50, bound=linear.STATE_BOUND, price=1.0, off_diagonal=1.0, entries="symmetric"
+    horizon=10,
+    control_horizon=None,
+    gamma=1.0,
+    steps=50,
+    bound=linear.STATE_BOUND,
+    price=1.0,
+    off_diagonal=1.0,
+    entries="symmetric",
 )
 SWEEP = {  # one choice at a time
     "base": {},
@@ -119,9 +126,13 @@ class LinearMPC(gm.ScenarioMPC):
         self.gamma, self.control_horizon = gamma, control_horizon
         x, goal = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
         value = plant.lq_value(x, goal, gamma)
-        terminal = ca.Function("terminal", [x, goal], [-ca.exp(-value) if objective == "goal" else value], {"never_inline": True})
+        terminal = ca.Function(
+            "terminal", [x, goal], [-ca.exp(-value) if objective == "goal" else value], {"never_inline": True}
+        )
         options = dict(goal=plant.EVAL_GOAL, compile=False) | options
-        super().__init__(plant, horizon, plant.SCENARIOS["nominal"], gm.costs(plant, objective)[0], terminal, **options)
+        super().__init__(
+            plant, horizon, plant.SCENARIOS["nominal"], gm.costs(plant, objective)[0], terminal, **options
+        )
 
     def weights(self):
         return super().weights() * self.gamma**self.tree.stage
@@ -130,18 +141,31 @@ class LinearMPC(gm.ScenarioMPC):
         problem, limits = super().build_problem(*costs)
         if self.control_horizon is not None:
             n, N = self.plant.A.shape[0], self.horizon
-            x, u = (ca.reshape(problem["x"][at.ravel("F").tolist()], n, N) for at in (self.at["x"], self.at["u"]))
+            x, u = (
+                ca.reshape(problem["x"][at.ravel("F").tolist()], n, N) for at in (self.at["x"], self.at["u"])
+            )
             x = ca.horzcat(problem["p"][:n], x * self.x_scale + self.x_center)
             goal = ca.reshape(problem["p"][2 * n :], n, N)
-            law = [self.plant.feedback(x[:, t], goal[:, t], self.gamma) for t in range(self.control_horizon, N)]
-            follows = ca.veccat(*(u[:, N - len(law) + i] - (action - self.u_center) / self.u_scale for i, action in enumerate(law)))
+            law = [
+                self.plant.feedback(x[:, t], goal[:, t], self.gamma) for t in range(self.control_horizon, N)
+            ]
+            follows = ca.veccat(
+                *(
+                    u[:, N - len(law) + i] - (action - self.u_center) / self.u_scale
+                    for i, action in enumerate(law)
+                )
+            )
             problem["g"] = ca.vertcat(problem["g"], follows)
             limits |= {name: np.append(limits[name], np.zeros(follows.numel())) for name in ("lbg", "ubg")}
         return problem, limits
 
     def build_shift(self):
         w, known = super().build_shift()[0], self.at["x"].size + self.at["slack"].size
-        return w, w, np.append(w[:known], np.arange(known, len(self.limits["lbg"])))  # the law's multipliers stay where they are
+        return (
+            w,
+            w,
+            np.append(w[:known], np.arange(known, len(self.limits["lbg"]))),
+        )  # the law's multipliers stay where they are
 
 
 def controller(plant, objective, settings):
@@ -177,7 +201,9 @@ def run_system(cell):
         for objective, mpc in both.items():
             x, u, _, log = gm.simulate(mpc, x0, plant.PSI_NOMINAL, np.zeros((steps, n)))
             compared, worse, costlier = 0, 0, 0
-            if objective == "goal":  # at every state of its closed loop: is its plan at least as good, by the right side, as LQ-MPC's?
+            if (
+                objective == "goal"
+            ):  # at every state of its closed loop: is its plan at least as good, by the right side, as LQ-MPC's?
                 both["quadratic"].reset()
                 mpc.reset()
                 for state in x[:-1]:
@@ -185,35 +211,61 @@ def run_system(cell):
                     for rival in rivals:
                         rival.make_step(state)
                     if all(rival.stats["rung"] in ("solved", "retry") for rival in rivals):
-                        (lq_side, lq_cost), (side, cost) = (judged_plan(rival, state, settings["price"]) for rival in rivals)
-                        compared, worse, costlier = compared + 1, worse + (side < lq_side - 1e-6), costlier + (cost > lq_cost + 1e-6)
+                        (lq_side, lq_cost), (side, cost) = (
+                            judged_plan(rival, state, settings["price"]) for rival in rivals
+                        )
+                        compared, worse, costlier = (
+                            compared + 1,
+                            worse + (side < lq_side - 1e-6),
+                            costlier + (cost > lq_cost + 1e-6),
+                        )
             left, right = jensen(trajectory_costs(plant, x, u, gamma), gamma)
             weights = gamma ** np.arange(steps + 1)
             distance = np.linalg.norm(x, axis=1)
             rows.append(
                 {
-                    "variant": variant, "controller": objective, "n": n, "system": system, "start": start,
+                    "variant": variant,
+                    "controller": objective,
+                    "n": n,
+                    "system": system,
+                    "start": start,
                     "steps_not_near": steps - envs.time_near_goal(plant, x[1:], plant.EVAL_GOAL),
                     "l2_error": np.sqrt((x[1:] ** 2).sum()),
                     "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
-                    "jensen_log_left": left, "jensen_log_right": right,
+                    "jensen_log_left": left,
+                    "jensen_log_right": right,
                     "log_indicator": np.log((weights * (distance <= 0.1)).sum() / weights.sum() + 1e-300),
-                    "plans_compared": compared, "plans_worse": worse, "plans_costlier": costlier,
-                    "solver_failures": sum(not s["success"] for s in log), "solve_ms_median": np.median([s["wall_ms"] for s in log]),
-                    "condition_L": np.linalg.cond(plant.transform), "norm_A": np.linalg.norm(plant.A, 2),
+                    "plans_compared": compared,
+                    "plans_worse": worse,
+                    "plans_costlier": costlier,
+                    "solver_failures": sum(not s["success"] for s in log),
+                    "solve_ms_median": np.median([s["wall_ms"] for s in log]),
+                    "condition_L": np.linalg.cond(plant.transform),
+                    "norm_A": np.linalg.norm(plant.A, 2),
                     "spectral_radius": np.abs(np.linalg.eigvals(plant.A)).max(),
                 }
-            )  # fmt: skip
+            )
     return [{k: round(float(v), 6) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
 
 
 def settings_of(args):
     """Variants, dimensions, systems and starts of a study."""
     if args.quick:
-        variants = {"base": {}} if args.study == "main" else {"base": {}, "control horizon 5": SWEEP["control horizon 5"]}
+        variants = (
+            {"base": {}}
+            if args.study == "main"
+            else {"base": {}, "control horizon 5": SWEEP["control horizon 5"]}
+        )
         return variants, (2, 4), 2, 2
-    variants, dimensions, systems, starts = ({"base": {}}, DIMENSIONS, 10, 10) if args.study == "main" else (SWEEP, (2, 8, 32), 5, 4)
-    return variants, dimensions, systems if args.systems is None else args.systems, starts if args.starts is None else args.starts
+    variants, dimensions, systems, starts = (
+        ({"base": {}}, DIMENSIONS, 10, 10) if args.study == "main" else (SWEEP, (2, 8, 32), 5, 4)
+    )
+    return (
+        variants,
+        dimensions,
+        systems if args.systems is None else args.systems,
+        starts if args.starts is None else args.starts,
+    )
 
 
 def collect(args):
@@ -224,7 +276,9 @@ def collect(args):
         for variant, change in variants.items()
         for system in range(args.seed, args.seed + systems)
     ]
-    rows = cells.collect(run_system, work, args.jobs, args.runs, [__file__, gm.__file__, envs.__file__, linear.__file__])
+    rows = cells.collect(
+        run_system, work, args.jobs, args.runs, [__file__, gm.__file__, envs.__file__, linear.__file__]
+    )
     order = {variant: i for i, variant in enumerate(variants)}
     rows.sort(key=lambda row: (order[row["variant"]], int(row["n"]), int(row["system"]), int(row["start"])))
     cells.write(rows, args.out / f"results/linear_scalability{'' if args.study == 'main' else '_sweep'}.csv")
@@ -244,21 +298,43 @@ def plot_main(args):
     rows = cells.read(args.out / "results/linear_scalability.csv")
     dimensions = sorted({int(row["n"]) for row in rows})
     fig, axes = plt.subplots(3, 1, figsize=(7, 6.4), sharex=True, layout="constrained")
-    print(f"{'n':>3s}  {'':22s}{'steps not near':>24s}{'l2 error':>24s}{'violation':>24s}{'failed':>8s}   median [2.5 %, 95 %]")
+    print(
+        f"{'n':>3s}  {'':22s}{'steps not near':>24s}{'l2 error':>24s}{'violation':>24s}{'failed':>8s}   median [2.5 %, 95 %]"
+    )
     for objective, colour in COLOURS.items():
         for ax, key in zip(axes, MEASURES):
-            bands = np.array([np.quantile(column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95]) for n in dimensions])
-            ax.plot(dimensions, bands[:, 1], "-" + MARKERS[objective], color=colour, lw=2, label=CONTROLLERS[objective])
+            bands = np.array(
+                [
+                    np.quantile(column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95])
+                    for n in dimensions
+                ]
+            )
+            ax.plot(
+                dimensions,
+                bands[:, 1],
+                "-" + MARKERS[objective],
+                color=colour,
+                lw=2,
+                label=CONTROLLERS[objective],
+            )
             ax.fill_between(dimensions, bands[:, 0], bands[:, 2], color=colour, alpha=0.2, lw=0)
     for n in dimensions:
         for objective, name in CONTROLLERS.items():
             line = ""
             for key in MEASURES:
-                low, median, high = np.quantile(column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95])
+                low, median, high = np.quantile(
+                    column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95]
+                )
                 line += f"{median:9.2f} [{low:5.2f}, {high:5.2f}]"
-            print(f"{n:3d}  {name:22s}{line}{column(rows, 'solver_failures', controller=objective, n=n).sum():8.0f}")
-        lq, goal = (column(rows, "steps_not_near", controller=objective, n=n) for objective in CONTROLLERS)  # paired by system and start
-        print(f"     the same start: {np.median(lq - goal):.2f} fewer steps (median), fewer in {(goal < lq).mean():.0%}")
+            print(
+                f"{n:3d}  {name:22s}{line}{column(rows, 'solver_failures', controller=objective, n=n).sum():8.0f}"
+            )
+        lq, goal = (
+            column(rows, "steps_not_near", controller=objective, n=n) for objective in CONTROLLERS
+        )  # paired by system and start
+        print(
+            f"     the same start: {np.median(lq - goal):.2f} fewer steps (median), fewer in {(goal < lq).mean():.0%}"
+        )
     for ax, label in zip(axes, MEASURES.values()):
         ax.set_ylabel(label)
         ax.set_ylim(bottom=0)
@@ -268,29 +344,66 @@ def plot_main(args):
     axes[-1].set_xlabel("number of states n")
     axes[0].legend(frameon=False)
     systems, starts = (len({row[key] for row in rows}) for key in ("system", "start"))
-    axes[0].set_title(f"{systems} systems per point, {starts} starts each; band: 2.5 to 95 percentile", fontsize=10)
+    axes[0].set_title(
+        f"{systems} systems per point, {starts} starts each; band: 2.5 to 95 percentile", fontsize=10
+    )
     save(fig, args.out / "figures/linear_scalability.png")
 
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    print("\neq:jensen on the closed loops, logarithms, medians: left side, right side, smallest margin, indicator sum (|x| <= 0.1)")
+    print(
+        "\neq:jensen on the closed loops, logarithms, medians: left side, right side, smallest margin, indicator sum (|x| <= 0.1)"
+    )
     for objective, colour in COLOURS.items():
-        left, right, indicator = ([column(rows, key, controller=objective, n=n) for n in dimensions]
-                                  for key in ("jensen_log_left", "jensen_log_right", "log_indicator"))  # fmt: skip
+        left, right, indicator = (
+            [column(rows, key, controller=objective, n=n) for n in dimensions]
+            for key in ("jensen_log_left", "jensen_log_right", "log_indicator")
+        )
         margins = [r - v for v, r in zip(left, right)]
         name, marker = CONTROLLERS[objective], MARKERS[objective]
-        axes[0].plot(dimensions, [np.median(m) for m in margins], "-" + marker, color=colour, lw=2, label=name)
-        axes[0].fill_between(dimensions, *np.array([np.quantile(m, [0.025, 0.95]) for m in margins]).T, color=colour, alpha=0.2, lw=0)
-        axes[1].plot(dimensions, [np.median(np.exp(r)) for r in right], "-" + marker, color=colour, lw=2, label=f"right side, {name}")
-        axes[1].plot(dimensions, [np.median(np.exp(i)) for i in indicator], ":" + marker, color=colour, lw=2, mfc="white",
-                     label=f"share of steps with |x| ≤ 0.1, {name}")  # fmt: skip
+        axes[0].plot(
+            dimensions, [np.median(m) for m in margins], "-" + marker, color=colour, lw=2, label=name
+        )
+        axes[0].fill_between(
+            dimensions,
+            *np.array([np.quantile(m, [0.025, 0.95]) for m in margins]).T,
+            color=colour,
+            alpha=0.2,
+            lw=0,
+        )
+        axes[1].plot(
+            dimensions,
+            [np.median(np.exp(r)) for r in right],
+            "-" + marker,
+            color=colour,
+            lw=2,
+            label=f"right side, {name}",
+        )
+        axes[1].plot(
+            dimensions,
+            [np.median(np.exp(i)) for i in indicator],
+            ":" + marker,
+            color=colour,
+            lw=2,
+            mfc="white",
+            label=f"share of steps with |x| ≤ 0.1, {name}",
+        )
         for i, n in enumerate(dimensions):
             medians = [np.median(values[i]) for values in (left, right, indicator)]
-            print(f"{n:3d}  {name:22s}{medians[0]:9.3f}{medians[1]:9.3f}{margins[i].min():11.2e}{medians[2]:9.3f}")
-    compared, worse, costlier = (column(rows, key, controller="goal").sum() for key in ("plans_compared", "plans_worse", "plans_costlier"))
-    print(f"of {compared:.0f} goal-conditioned plans, right side below that of LQ-MPC's plan at the same state: {worse:.0f}; "
-          f"objective with slack worse than of LQ-MPC's plan (local optima): {costlier:.0f}")  # fmt: skip
+            print(
+                f"{n:3d}  {name:22s}{medians[0]:9.3f}{medians[1]:9.3f}{margins[i].min():11.2e}{medians[2]:9.3f}"
+            )
+    compared, worse, costlier = (
+        column(rows, key, controller="goal").sum()
+        for key in ("plans_compared", "plans_worse", "plans_costlier")
+    )
+    print(
+        f"of {compared:.0f} goal-conditioned plans, right side below that of LQ-MPC's plan at the same state: {worse:.0f}; "
+        f"objective with slack worse than of LQ-MPC's plan (local optima): {costlier:.0f}"
+    )
     axes[0].set(xlabel="number of states n", ylabel="log right side − log left side", yscale="log")
-    axes[1].set(xlabel="number of states n", ylabel="weighted mean over the episode", ylim=(0.885, 1))  # room for the legend
+    axes[1].set(
+        xlabel="number of states n", ylabel="weighted mean over the episode", ylim=(0.885, 1)
+    )  # room for the legend
     for ax in axes:
         ax.set_xscale("log", base=2)
         ax.set_xticks(dimensions, dimensions)
@@ -301,7 +414,10 @@ def plot_main(args):
 
 def plot_sweep(args):
     rows = cells.read(args.out / "results/linear_scalability_sweep.csv")
-    variants, dimensions = list(dict.fromkeys(row["variant"] for row in rows)), sorted({int(row["n"]) for row in rows})
+    variants, dimensions = (
+        list(dict.fromkeys(row["variant"] for row in rows)),
+        sorted({int(row["n"]) for row in rows}),
+    )
     size = (2 + 2.7 * len(dimensions), 1.4 + 0.32 * len(variants))
     fig, axes = plt.subplots(1, len(dimensions), figsize=size, sharey=True, layout="constrained")
     print(
@@ -318,7 +434,13 @@ def plot_sweep(args):
                 medians[objective] = np.median(values)
                 at = -position + (0.15 if objective == "goal" else -0.15)
                 ax.plot(np.quantile(values, [0.025, 0.95]), [at, at], color=colour, alpha=0.4, lw=3)
-                ax.plot(medians[objective], at, MARKERS[objective], color=colour, label=CONTROLLERS[objective] if not position else None)
+                ax.plot(
+                    medians[objective],
+                    at,
+                    MARKERS[objective],
+                    color=colour,
+                    label=CONTROLLERS[objective] if not position else None,
+                )
             failed = column(rows, "solver_failures", variant=variant, n=n).sum()
             line += f"{medians['quadratic']:10.2f}{medians['goal']:7.2f}{medians['quadratic'] - medians['goal']:7.2f}{failed:6.0f}"
         print(line)

@@ -94,7 +94,10 @@ class Args:
 
 def agent_folder(args, dim, system):
     """Agents of the scaling study have a smaller budget and a folder of their own."""
-    return args.runs / f"agents/{dim}_{system}{'' if dim == args.dim else '_scaling'}{'_quick' if args.quick else ''}"
+    return (
+        args.runs
+        / f"agents/{dim}_{system}{'' if dim == args.dim else '_scaling'}{'_quick' if args.quick else ''}"
+    )
 
 
 def checkpoint(args, dim, system):
@@ -102,7 +105,9 @@ def checkpoint(args, dim, system):
     found = list(agent_folder(args, dim, system).glob("*/wall_seconds.txt"))
     if not found:
         command = f"python experiments/linear_value_mpc.py --study train --dim {args.dim} --systems {args.systems} --runs {args.runs}"
-        cells.fail(f"no trained agent in {agent_folder(args, dim, system)}; first run {command}{' --quick' if args.quick else ''}")
+        cells.fail(
+            f"no trained agent in {agent_folder(args, dim, system)}; first run {command}{' --quick' if args.quick else ''}"
+        )
     return found[0].parent / "checkpoint.pt"
 
 
@@ -115,14 +120,37 @@ def train(args, dim, system):
         if interrupted:
             command += ["--resume", str(interrupted[0])]
         else:
-            command += ["--env", "linear", "--dim", str(dim), "--system", str(system), "--seed", str(system), "--out", str(parent)]
+            command += [
+                "--env",
+                "linear",
+                "--dim",
+                str(dim),
+                "--system",
+                str(system),
+                "--seed",
+                str(system),
+                "--out",
+                str(parent),
+            ]
             command += ["--save-every", "100000"]
             if dim != args.dim:
                 command += ["--total-timesteps", "100000"]
             if args.quick:
-                command += ["--total-timesteps", "2000", "--learning-starts", "500", "--eval-every", "1000", "--hidden", "16", "16"]
+                command += [
+                    "--total-timesteps",
+                    "2000",
+                    "--learning-starts",
+                    "500",
+                    "--eval-every",
+                    "1000",
+                    "--hidden",
+                    "16",
+                    "16",
+                ]
         tick = time.perf_counter()
-        result = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        result = subprocess.run(
+            command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        )
         if result.returncode:
             raise RuntimeError(f"training of system {system} stopped: {result.stderr[-2000:]}")
         run = max(parent.iterdir(), key=lambda path: path.stat().st_mtime)
@@ -132,10 +160,21 @@ def train(args, dim, system):
     data = torch.load(run / "checkpoint.pt", weights_only=True)
     last = list(csv.DictReader(open(run / "evaluations.csv")))[-1]
     sizes = {name: sum(v.numel() for v in data[name].values()) for name in ("actor", "critic")}
-    return {"n": dim, "system": system, "seed": data["args"]["seed"], "transitions": last["step"], "updates": last["updates"],
-            "train_seconds": last["train_seconds"], "wall_seconds": (run / "wall_seconds.txt").read_text(), "jobs": args.jobs,
-            "error_median": last["nominal_median_ape"], "error_p75": last["nominal_p75_ape"], "alpha": data["alpha"],
-            "parameters_actor": sizes["actor"], "parameters_one_critic": sizes["critic"] // 2}  # fmt: skip
+    return {
+        "n": dim,
+        "system": system,
+        "seed": data["args"]["seed"],
+        "transitions": last["step"],
+        "updates": last["updates"],
+        "train_seconds": last["train_seconds"],
+        "wall_seconds": (run / "wall_seconds.txt").read_text(),
+        "jobs": args.jobs,
+        "error_median": last["nominal_median_ape"],
+        "error_p75": last["nominal_p75_ape"],
+        "alpha": data["alpha"],
+        "parameters_actor": sizes["actor"],
+        "parameters_one_critic": sizes["critic"] // 2,
+    }
 
 
 def train_all(args):
@@ -143,16 +182,27 @@ def train_all(args):
         (n, args.seed) for n in scaling_dimensions(args)[:-1]
     ]
     with ThreadPoolExecutor(args.jobs) as pool:
-        rows = list(tqdm(pool.map(lambda agent: train(args, *agent), agents), total=len(agents), unit="agent", disable=None))
+        rows = list(
+            tqdm(
+                pool.map(lambda agent: train(args, *agent), agents),
+                total=len(agents),
+                unit="agent",
+                disable=None,
+            )
+        )
     cells.write(rows, args.out / "results/linear_value_mpc_training.csv")
     rows = rows[: args.systems]
-    print("system  updates  seconds  error %, median  75th percentile  (root mean square of the state over steps 26 to 50)")
+    print(
+        "system  updates  seconds  error %, median  75th percentile  (root mean square of the state over steps 26 to 50)"
+    )
     for row in rows:
         print(
             f"{row['system']:6d}{row['updates']:>9s}{float(row['train_seconds']):9.0f}{float(row['error_median']):17.2f}{float(row['error_p75']):17.2f}"
         )
-    print(f"median over systems {np.median([float(row['error_median']) for row in rows]):.2f} %, "
-          f"at most {max(float(row['train_seconds']) for row in rows):.0f} s per agent")  # fmt: skip
+    print(
+        f"median over systems {np.median([float(row['error_median']) for row in rows]):.2f} %, "
+        f"at most {max(float(row['train_seconds']) for row in rows):.0f} s per agent"
+    )
 
 
 # Closed loops
@@ -177,7 +227,9 @@ def build(label, dim, system, horizon, critic, compile=True):
     """A controller of the figure for one system."""
     settings = CONTROLLERS[label][2]
     if settings is None:
-        return gm.build_controller(gm.Args(env="linear", dim=dim, system=system, horizon=horizon, slack_weight=1.0, compile=False))
+        return gm.build_controller(
+            gm.Args(env="linear", dim=dim, system=system, horizon=horizon, slack_weight=1.0, compile=False)
+        )
     settings = deploy.Args(env="linear", critic=critic, horizon=horizon, compile=compile, **settings)
     if label not in ("goal-conditioned MPC, no value", "RL+MPC, taylor"):
         return deploy.build_controller(settings.controllers[0], settings)
@@ -189,7 +241,16 @@ def build(label, dim, system, horizon, critic, compile=True):
         value, policy = taylor_value(critic), deploy.export(critic)[0]
     else:  # far from the goal the stage cost is flat: from middle actions no solver would find the way
         value, policy = None, ca.Function("regulator", [x, goal], [plant.feedback(x, goal)])
-    return deploy.ScenarioMPC(plant, horizon, plant.SCENARIOS["mpc"], stage, value, goal=plant.EVAL_GOAL, policy=policy, compile=compile)
+    return deploy.ScenarioMPC(
+        plant,
+        horizon,
+        plant.SCENARIOS["mpc"],
+        stage,
+        value,
+        goal=plant.EVAL_GOAL,
+        policy=policy,
+        compile=compile,
+    )
 
 
 def run_loop(controller, plant, x0, steps):
@@ -204,7 +265,9 @@ def run_loop(controller, plant, x0, steps):
 
 def failed(stats):
     """Whether a step had no plan or left a problem unsolved."""
-    return not stats["success"] if "success" in stats else stats["fell_back"] or stats.get("stop") == "unsolved"
+    return (
+        not stats["success"] if "success" in stats else stats["fell_back"] or stats.get("stop") == "unsolved"
+    )
 
 
 def measures(plant, x, log):
@@ -215,32 +278,51 @@ def measures(plant, x, log):
         "l2_error": np.sqrt((x[1:] ** 2).sum()),
         "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
         "final_norm": np.linalg.norm(x[-1]),
-        "solve_ms_median": np.median(milliseconds), "solve_ms_p95": np.quantile(milliseconds, 0.95), "solve_ms_max": max(milliseconds),
+        "solve_ms_median": np.median(milliseconds),
+        "solve_ms_p95": np.quantile(milliseconds, 0.95),
+        "solve_ms_max": max(milliseconds),
         "solve_ms_transient": np.mean(milliseconds[:5]),
         "iterations": sum(s.get("iterations", 0) for s in log),
         "solver_failures": sum(map(failed, log)),
-    }  # fmt: skip
+    }
 
 
 def start_states(dim, system, starts):
     plant = envs.load("linear", dim=dim, system=system)
-    return plant, np.stack([envs.sample_states(plant, np.random.default_rng([dim, system, i + 1]), 1)[0] for i in range(starts)])
+    return plant, np.stack(
+        [envs.sample_states(plant, np.random.default_rng([dim, system, i + 1]), 1)[0] for i in range(starts)]
+    )
 
 
 def run_cell(cell):
     """One controller on one system from every start, at one horizon and at some distances: rows, each with its profile as text."""
     label, dim, system, horizon, scales, starts, steps, critic, jobs, compile = cell
     torch.set_num_threads(1)
-    controller, (plant, x0s) = build(label, dim, system, horizon, Path(critic), compile), start_states(dim, system, starts)
+    controller, (plant, x0s) = (
+        build(label, dim, system, horizon, Path(critic), compile),
+        start_states(dim, system, starts),
+    )
     rows = []
     for scale in scales:
         for i, x0 in enumerate(x0s):
             x, log = run_loop(controller, plant, scale * x0, steps)
-            head = {"controller": label, "n": dim, "horizon": horizon, "system": system, "start": i, "scale": scale,
-                    "jobs": jobs}  # fmt: skip
-            rows.append(head | {k: round(float(v), 5) for k, v in measures(plant, x, log).items()}
-                        | {"norms": " ".join(f"{v:.4g}" for v in np.linalg.norm(x, axis=1)),
-                           "times": " ".join(f"{s['wall_ms']:.4g}" for s in log)})  # fmt: skip
+            head = {
+                "controller": label,
+                "n": dim,
+                "horizon": horizon,
+                "system": system,
+                "start": i,
+                "scale": scale,
+                "jobs": jobs,
+            }
+            rows.append(
+                head
+                | {k: round(float(v), 5) for k, v in measures(plant, x, log).items()}
+                | {
+                    "norms": " ".join(f"{v:.4g}" for v in np.linalg.norm(x, axis=1)),
+                    "times": " ".join(f"{s['wall_ms']:.4g}" for s in log),
+                }
+            )
     return rows
 
 
@@ -280,11 +362,19 @@ def profile(args):
     curves = []
     for label in CONTROLLERS:
         mine = [row for row in rows if row["controller"] == label]
-        norms, times = (np.array([np.fromstring(row[key], sep=" ") for row in mine]) for key in ("norms", "times"))
+        norms, times = (
+            np.array([np.fromstring(row[key], sep=" ") for row in mine]) for key in ("norms", "times")
+        )
         for t in range(norms.shape[1]):
-            curve = dict(zip(("norm_low", "norm_median", "norm_high"), np.quantile(norms[:, t], [0.025, 0.5, 0.95])))
-            late = np.minimum(t, times.shape[1] - 1)  # no action is computed at the last state: its time is repeated
-            curve |= dict(zip(("ms_low", "ms_median", "ms_high"), np.quantile(times[:, late], [0.025, 0.5, 0.95])))
+            curve = dict(
+                zip(("norm_low", "norm_median", "norm_high"), np.quantile(norms[:, t], [0.025, 0.5, 0.95]))
+            )
+            late = np.minimum(
+                t, times.shape[1] - 1
+            )  # no action is computed at the last state: its time is repeated
+            curve |= dict(
+                zip(("ms_low", "ms_median", "ms_high"), np.quantile(times[:, late], [0.025, 0.5, 0.95]))
+            )
             curves.append({"controller": label, "step": t} | {k: float(f"{v:.5g}") for k, v in curve.items()})
     cells.write(curves, args.out / "results/linear_value_mpc_profile.csv")
 
@@ -295,46 +385,73 @@ def paired(rows, label):
 
 
 def plot_profile(args):
-    rows, curves = (cells.read(args.out / f"results/{name}.csv") for name in ("linear_value_mpc", "linear_value_mpc_profile"))
+    rows, curves = (
+        cells.read(args.out / f"results/{name}.csv")
+        for name in ("linear_value_mpc", "linear_value_mpc_profile")
+    )
     fig, axes = plt.subplots(2, 1, figsize=(8, 6.4), sharex=True, layout="constrained")
     baseline = {}
-    print(f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}{'ms median':>11s}"
-          f"{'first 5':>9s}{'worst':>8s}{'failed':>8s}")  # fmt: skip
+    print(
+        f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}{'ms median':>11s}"
+        f"{'first 5':>9s}{'worst':>8s}{'failed':>8s}"
+    )
     labels = [label for label in CONTROLLERS if any(row["controller"] == label for row in curves)]
     for label in labels:
         colour, dashes, _ = CONTROLLERS[label]
-        mine = {key: np.array([row[key] for row in curves if row["controller"] == label]).astype(float) for key in list(curves[0])[1:]}
+        mine = {
+            key: np.array([row[key] for row in curves if row["controller"] == label]).astype(float)
+            for key in list(curves[0])[1:]
+        }
         for ax, key, floor in zip(axes, ("norm", "ms"), (1e-3, 0)):
             if key == "norm" or "actor" not in label:
-                low, median, high = (np.maximum(mine[f"{key}_{name}"], floor) for name in ("low", "median", "high"))
-                width = 4.5 if label == "goal-conditioned MPC, no value" and key == "norm" else 2  # on which the others lie
+                low, median, high = (
+                    np.maximum(mine[f"{key}_{name}"], floor) for name in ("low", "median", "high")
+                )
+                width = (
+                    4.5 if label == "goal-conditioned MPC, no value" and key == "norm" else 2
+                )  # on which the others lie
                 ax.plot(mine["step"], median, color=colour, ls=dashes, lw=width, label=label)
                 ax.fill_between(mine["step"], low, high, color=colour, alpha=0.12, lw=0)
-        mine = {key: np.array([float(row[key]) for row in rows if row["controller"] == label]) for key in list(rows[0])[7:]}
+        mine = {
+            key: np.array([float(row[key]) for row in rows if row["controller"] == label])
+            for key in list(rows[0])[7:]
+        }
         baseline[label] = {key: np.median(values) for key, values in mine.items()}
         spread = "".join(
-            f"{np.median(mine[k]):8.2f} [{np.quantile(mine[k], 0.025):5.2f},{np.quantile(mine[k], 0.95):6.2f}]" for k in MEASURES[:2]
+            f"{np.median(mine[k]):8.2f} [{np.quantile(mine[k], 0.025):5.2f},{np.quantile(mine[k], 0.95):6.2f}]"
+            for k in MEASURES[:2]
         )
         violation, end, milliseconds, early = (
-            baseline[label][key] for key in ("constraint_violation", "final_norm", "solve_ms_median", "solve_ms_transient")
+            baseline[label][key]
+            for key in ("constraint_violation", "final_norm", "solve_ms_median", "solve_ms_transient")
         )
         worst, failed = mine["solve_ms_max"].max(), mine["solver_failures"].sum()
-        print(f"{label:42s}{spread}{violation:10.2f}{end:9.4f}{milliseconds:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}")
+        print(
+            f"{label:42s}{spread}{violation:10.2f}{end:9.4f}{milliseconds:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}"
+        )
     plain = baseline["goal-conditioned MPC, no value"]
     for label in labels[3:]:
-        print(f"{label}: solve time over that without a value, median {baseline[label]['solve_ms_median'] / plain['solve_ms_median']:.2f}, "
-              f"first five steps {baseline[label]['solve_ms_transient'] / plain['solve_ms_transient']:.2f}")  # fmt: skip
+        print(
+            f"{label}: solve time over that without a value, median {baseline[label]['solve_ms_median'] / plain['solve_ms_median']:.2f}, "
+            f"first five steps {baseline[label]['solve_ms_transient'] / plain['solve_ms_transient']:.2f}"
+        )
     actor = paired(rows, "RL (actor alone)")
     for label in labels[1:]:
         gain = actor - paired(rows, label)
-        print(f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}")
+        print(
+            f"{label}: {np.median(gain):.2f} fewer steps not near the origin than the actor (median), fewer in {(gain > 0).mean():.0%}"
+        )
     axes[0].set(ylabel="|x|, below 0.001 drawn there", yscale="log", xlim=(0, 12))
     axes[1].set(ylabel="solve time [ms]", yscale="log", xlabel="step")
     systems, starts = (len({row[key] for row in rows}) for key in ("system", "start"))
-    axes[0].set_title(f"{systems} systems, {starts} starts each; lines: medians, bands: 2.5 to 95 percentile", fontsize=10)
+    axes[0].set_title(
+        f"{systems} systems, {starts} starts each; lines: medians, bands: 2.5 to 95 percentile", fontsize=10
+    )
     for ax in axes:
         ax.grid(alpha=0.3)
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    fig.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9
+    )
     save(fig, args.out / "figures/linear_value_mpc.png")
 
 
@@ -353,28 +470,60 @@ def distance(args):
     horizons, scales = ((1, 2), (0.1, 1.0)) if args.quick else (DISTANCE_HORIZONS, DISTANCES)
     labels = [label for label in CONTROLLERS if "regulator" not in label]
     rows = collect(args, labels, horizons, scales)
-    cells.write([without(row, "norms", "times") for row in rows], args.out / "results/linear_value_mpc_distance.csv")
+    cells.write(
+        [without(row, "norms", "times") for row in rows], args.out / "results/linear_value_mpc_distance.csv"
+    )
 
 
 def plot_distance(args):
     rows = cells.read(args.out / "results/linear_value_mpc_distance.csv")
     horizons, scales = (list(dict.fromkeys(row[key] for row in rows)) for key in ("horizon", "scale"))
     labels = [label for label in CONTROLLERS if any(row["controller"] == label for row in rows)]
-    fig, axes = plt.subplots(1, len(horizons), figsize=(10, 3.6), sharey=True, layout="constrained", squeeze=False)
-    print(f"median steps not near the origin, failed solves of all; starts in a box of half-width {', '.join(scales)}")
+    fig, axes = plt.subplots(
+        1, len(horizons), figsize=(10, 3.6), sharey=True, layout="constrained", squeeze=False
+    )
+    print(
+        f"median steps not near the origin, failed solves of all; starts in a box of half-width {', '.join(scales)}"
+    )
     for ax, horizon in zip(axes[0], horizons):
         for offset, label in zip(np.linspace(-0.2, 0.2, len(labels)), labels):
             colour, dashes, _ = CONTROLLERS[label]
-            mine = [row for row in rows if row["controller"] == label and (row["horizon"] == horizon or "actor" in label)]
-            steps = [np.median([float(row["steps_not_near"]) for row in mine if row["scale"] == scale]) for scale in scales]
-            ax.plot(np.arange(len(scales)) + offset, steps, marker="o", color=colour, ls=dashes, lw=1.5, label=label)
-            failed = [sum(int(float(row["solver_failures"])) for row in mine if row["scale"] == scale) for scale in scales]
-            print(f"N = {horizon:3s} {label:42s}" + "".join(f"{s:9.2f} ({f:4d})" for s, f in zip(steps, failed)))
+            mine = [
+                row
+                for row in rows
+                if row["controller"] == label and (row["horizon"] == horizon or "actor" in label)
+            ]
+            steps = [
+                np.median([float(row["steps_not_near"]) for row in mine if row["scale"] == scale])
+                for scale in scales
+            ]
+            ax.plot(
+                np.arange(len(scales)) + offset,
+                steps,
+                marker="o",
+                color=colour,
+                ls=dashes,
+                lw=1.5,
+                label=label,
+            )
+            failed = [
+                sum(int(float(row["solver_failures"])) for row in mine if row["scale"] == scale)
+                for scale in scales
+            ]
+            print(
+                f"N = {horizon:3s} {label:42s}" + "".join(f"{s:9.2f} ({f:4d})" for s, f in zip(steps, failed))
+            )
         ax.set_xticks(range(len(scales)), scales)
         ax.set(title=f"N = {horizon}", ylim=(-0.3, None), xlabel="half-width of the start box")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("steps not near the origin")
-    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    fig.legend(
+        *axes[0, 0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=9,
+    )
     save(fig, args.out / "figures/linear_value_mpc_distance.png")
 
 
@@ -389,9 +538,27 @@ def scaling(args):
     """Solve times of one system: against n at the horizon, against the horizon at n = dim."""
     dimensions, horizons = scaling_dimensions(args), SCALING_HORIZONS[: 2 if args.quick else None]
     starts, steps, rows = min(args.starts, 5), min(args.steps, 20), []
-    for axis, pairs in (("n", [(n, args.horizon) for n in dimensions]), ("horizon", [(dimensions[-1], N) for N in horizons])):
-        work = [(label, n, args.seed, N, (1.0,), starts, steps, str(checkpoint(args, n, args.seed)), args.jobs, not args.quick)
-                for n, N in pairs for label in CONTROLLERS if "actor" not in label]  # fmt: skip
+    for axis, pairs in (
+        ("n", [(n, args.horizon) for n in dimensions]),
+        ("horizon", [(dimensions[-1], N) for N in horizons]),
+    ):
+        work = [
+            (
+                label,
+                n,
+                args.seed,
+                N,
+                (1.0,),
+                starts,
+                steps,
+                str(checkpoint(args, n, args.seed)),
+                args.jobs,
+                not args.quick,
+            )
+            for n, N in pairs
+            for label in CONTROLLERS
+            if "actor" not in label
+        ]
         found = cells.collect(run_cell, work, args.jobs, args.runs / "scaling", inputs())
         rows += [{"axis": axis} | without(row, "norms", "times") for row in found]
     cells.write(rows, args.out / "results/linear_value_mpc_times.csv")
@@ -400,12 +567,19 @@ def scaling(args):
 def plot_scaling(args):
     rows = cells.read(args.out / "results/linear_value_mpc_times.csv")
     fig, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")
-    labels = [label for label in CONTROLLERS if "actor" not in label and any(row["controller"] == label for row in rows)]
+    labels = [
+        label
+        for label in CONTROLLERS
+        if "actor" not in label and any(row["controller"] == label for row in rows)
+    ]
     for ax, axis in zip(axes, ("n", "horizon")):
         values = sorted({int(row[axis]) for row in rows if row["axis"] == axis})
         print(f"{axis}: median ms per step and (mean ms of the first five steps) at {values}")
         for label in labels:
-            mine = [[row for row in rows if (row["axis"], row["controller"], row[axis]) == (axis, label, str(v))] for v in values]
+            mine = [
+                [row for row in rows if (row["axis"], row["controller"], row[axis]) == (axis, label, str(v))]
+                for v in values
+            ]
             early = [np.median([float(row["solve_ms_transient"]) for row in group]) for group in mine]
             late = [np.median([float(row["solve_ms_median"]) for row in group]) for group in mine]
             colour, dashes, _ = CONTROLLERS[label]
@@ -416,14 +590,27 @@ def plot_scaling(args):
         ax.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("solve time, mean of steps 1 to 5 [ms]")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    fig.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=9
+    )
     save(fig, args.out / "figures/linear_value_mpc_times.png")
 
 
 def main(args):
-    table = {"train": "training", "profile": "profile", "distance": "distance", "scaling": "times"}[args.study]
-    cells.check(args, f"linear_value_mpc_{table}.csv", dim=(1, 512), systems=(1, 1000), starts=(1, 1000), steps=(5, 10**6),
-                horizon=(1, 1000), jobs=(1, 1024), seed=(0, 10**9))  # fmt: skip
+    table = {"train": "training", "profile": "profile", "distance": "distance", "scaling": "times"}[
+        args.study
+    ]
+    cells.check(
+        args,
+        f"linear_value_mpc_{table}.csv",
+        dim=(1, 512),
+        systems=(1, 1000),
+        starts=(1, 1000),
+        steps=(5, 10**6),
+        horizon=(1, 1000),
+        jobs=(1, 1024),
+        seed=(0, 10**9),
+    )
     if args.quick:
         args = replace(args, dim=3, systems=2, starts=2, steps=5)
     if args.study == "train":

@@ -28,7 +28,12 @@ class IpoptMPC(gm.ScenarioMPC):
 
     # IPOPT would widen every bound by 1e-8; times a slack price of 4,500 (100 per degC, scaled) and 20 stages that is 1 % of the cost.
     # Variables are scaled already: MUMPS need not, nor refine every solution (a tenth of the time)
-    cold = gm.ScenarioMPC.cold | {"max_iter": 200, "mumps_permuting_scaling": 0, "mumps_scaling": 0, "min_refinement_steps": 0}
+    cold = gm.ScenarioMPC.cold | {
+        "max_iter": 200,
+        "mumps_permuting_scaling": 0,
+        "mumps_scaling": 0,
+        "min_refinement_steps": 0,
+    }
 
     def __init__(self, *arguments, policy=None, barrier=1e-4, **options):
         self.policy = policy
@@ -45,7 +50,9 @@ class IpoptMPC(gm.ScenarioMPC):
         """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
         tree, x, states, actions = self.tree, (x0 - self.x_center)[:, None] / self.x_scale[:, None], [], []
         for t in range(self.horizon):
-            u = np.array(action(t, x * self.x_scale[:, None] + self.x_center[:, None])).reshape(len(self.u_scale), -1)
+            u = np.array(action(t, x * self.x_scale[:, None] + self.x_center[:, None])).reshape(
+                len(self.u_scale), -1
+            )
             actions.append(np.clip(u, self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None]))
             here = slice(tree.first[t + 1], tree.first[t + 2])
             parent, psi = tree.parent[here] - tree.first[t], self.scenarios[tree.scenario[here]].T
@@ -126,7 +133,9 @@ class RelaxedMPC(IpoptMPC):
             self.relaxed.reset(u)
 
     def solve(self, *arguments):
-        relaxed = self.relaxed is not None and self.stats["rung"] == "retry"  # a second try is the other problem's
+        relaxed = (
+            self.relaxed is not None and self.stats["rung"] == "retry"
+        )  # a second try is the other problem's
         return None if relaxed else super().solve(*arguments)
 
     def action(self, x, tick):
@@ -142,7 +151,9 @@ class RelaxedMPC(IpoptMPC):
         self.stats |= other.stats | {"success": False, "iterations": spent + other.stats["iterations"]}
         self.infeasible, self.plan = True, None
         if not self.stats["fell_back"]:
-            hard = np.isinf(np.concatenate([price[rows] for price, rows in zip(self.slack_price, other.priced)]))
+            hard = np.isinf(
+                np.concatenate([price[rows] for price, rows in zip(self.slack_price, other.priced)])
+            )
             self.infeasible = other.solution[other.at["slack"]].max(axis=1)[hard].max() > FEASIBLE
             w = self.vector(*other.planned(other.plan[0]))
             self.plan = w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"]))
@@ -153,8 +164,13 @@ class PrintedMPC(IpoptMPC):
     """eq:QMPC as printed: stage cost and soft constraints at x_0 ... x_{N-1}, so that nothing bounds the last state but its value."""
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, **options):
-        x, u, goal = (ca.MX.sym(name, n) for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX))))
-        stage = ca.Function("stage", [x, u, goal], [stage_cost(x, goal)], {"never_inline": True})  # of a state and its action: before x_N
+        x, u, goal = (
+            ca.MX.sym(name, n)
+            for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX)))
+        )
+        stage = ca.Function(
+            "stage", [x, u, goal], [stage_cost(x, goal)], {"never_inline": True}
+        )  # of a state and its action: before x_N
         super().__init__(plant, horizon, scenarios, stage, terminal_cost, **options)
 
     def build_problem(self, *costs):
@@ -170,10 +186,25 @@ class LiteralMPC(PrintedMPC):
     since that state has no soft constraint the other scenarios are not there.
     """
 
-    def __init__(self, plant, horizon, scenarios, *costs, robust_horizon=1, slack_price=1.0, change_weight=0.0, **options):
+    def __init__(
+        self,
+        plant,
+        horizon,
+        scenarios,
+        *costs,
+        robust_horizon=1,
+        slack_price=1.0,
+        change_weight=0.0,
+        **options,
+    ):
         S = len(scenarios) if robust_horizon else 1
-        options |= dict(slack_price=S * np.array(slack_price), change_weight=S * np.broadcast_to(change_weight, len(plant.U_LOW)))
-        super().__init__(plant, horizon, scenarios, *costs, robust_horizon=robust_horizon if horizon > 1 else 0, **options)
+        options |= dict(
+            slack_price=S * np.array(slack_price),
+            change_weight=S * np.broadcast_to(change_weight, len(plant.U_LOW)),
+        )
+        super().__init__(
+            plant, horizon, scenarios, *costs, robust_horizon=robust_horizon if horizon > 1 else 0, **options
+        )
 
 
 def squared_error(plant):
@@ -185,7 +216,9 @@ def squared_error(plant):
 def gaussian(plant, sigma2=None):
     """Stage cost of RL+MPC; sigma2: the plant's by default."""
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
-    return ca.Function("stage", [x, g], [-ca.exp(-squared_error(plant)(x, g) / (2 * (sigma2 or plant.MPC_SIGMA2)))])
+    return ca.Function(
+        "stage", [x, g], [-ca.exp(-squared_error(plant)(x, g) / (2 * (sigma2 or plant.MPC_SIGMA2)))]
+    )
 
 
 def negative(V):
@@ -203,13 +236,19 @@ def build_controller(name, args, kind=IpoptMPC):
     scenarios, options = plant.SCENARIOS["mpc"], dict(goal=goal, compile=args.compile)
     if name in ("nominal_mpc", "robust_mpc"):
         S, benchmark = len(scenarios) if name == "robust_mpc" else 1, plant.BENCHMARK
-        options |= dict(robust_horizon=int(S > 1), slack_price=S * benchmark["slack_price"], change_weight=S * benchmark["change_weight"])
+        options |= dict(
+            robust_horizon=int(S > 1),
+            slack_price=S * benchmark["slack_price"],
+            change_weight=S * benchmark["change_weight"],
+        )
         return RelaxedMPC(plant, benchmark["horizon"], scenarios, squared_error(plant), **options)
     if name != "rl_mpc":
         raise ValueError(f"{name!r} is not a controller by IPOPT; choose nominal_mpc, robust_mpc or rl_mpc")
     mu, _, V = deploy.export(critic)
     slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
-    options |= dict(robust_horizon=args.robust_horizon, slack_price=slack_weight if args.constraints == "soft" else np.inf)
+    options |= dict(
+        robust_horizon=args.robust_horizon, slack_price=slack_weight if args.constraints == "soft" else np.inf
+    )
     # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
     options |= dict(policy=mu, barrier="adaptive")
     return kind(plant, args.horizon, scenarios, gaussian(plant), negative(V), **options)

@@ -39,7 +39,9 @@ def native_value(weights):
             h = silu(h) if i < n - 1 else h
         return h
 
-    z = ca.vertcat((x - w["x_center"]) / w["x_scale"], (goal - x[w["goal_index"].tolist()]) / w["error_scale"])
+    z = ca.vertcat(
+        (x - w["x_center"]) / w["x_scale"], (goal - x[w["goal_index"].tolist()]) / w["error_scale"]
+    )
     return ca.Function("V", [x, goal], [mlp("critic", ca.vertcat(z, ca.tanh(mlp("actor", z))))])
 
 
@@ -48,13 +50,19 @@ def l4casadi_value(weights):
     import l4casadi
     import torch
 
-    w = {k: torch.tensor(v, dtype=torch.long if k == "goal_index" else torch.float32) for k, v in weights.items()}
+    w = {
+        k: torch.tensor(v, dtype=torch.long if k == "goal_index" else torch.float32)
+        for k, v in weights.items()
+    }
     n_x = len(w["x_center"])
 
     class Value(torch.nn.Module):
         def forward(self, inputs):  # (1, n_x + n_goal)
             x, goal = inputs[..., :n_x], inputs[..., n_x:]
-            z = torch.cat([(x - w["x_center"]) / w["x_scale"], (goal - x[..., w["goal_index"]]) / w["error_scale"]], dim=-1)
+            z = torch.cat(
+                [(x - w["x_center"]) / w["x_scale"], (goal - x[..., w["goal_index"]]) / w["error_scale"]],
+                dim=-1,
+            )
 
             def mlp(name, h):
                 n = len([k for k in w if k.startswith(name + "_w")])
@@ -79,7 +87,11 @@ def build(problem):
     u = ca.vertcat(*(model.set_variable("_u", name) for name in plant.ACTION_NAMES))
     psi = ca.vertcat(*(model.set_variable("_p", name) for name in plant.PSI_NAMES))
     xs, us, psis = (ca.SX.sym(name, v.numel()) for name, v in (("x", x), ("u", u), ("psi", psi)))
-    rhs = envs.rk4(plant.ode, xs, us, psis, dt, plant.MODEL_SUBSTEPS, ca) if discrete else plant.ode(xs, us, psis, ca)
+    rhs = (
+        envs.rk4(plant.ode, xs, us, psis, dt, plant.MODEL_SUBSTEPS, ca)
+        if discrete
+        else plant.ode(xs, us, psis, ca)
+    )
     rhs = ca.Function("rhs", [xs, us, psis], [rhs])(x, u, psi)
     for i, name in enumerate(plant.STATE_NAMES):
         model.set_rhs(name, rhs[i])
@@ -87,14 +99,32 @@ def build(problem):
     x = model.x.cat  # set-up has put symbols of its own in place of those above
 
     mpc = do_mpc.controller.MPC(model)
-    options = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": problem["tol"], "ipopt.max_iter": 500,
-               "ipopt.bound_relax_factor": 0.0}  # fmt: skip
+    options = {
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "print_time": 0,
+        "ipopt.tol": problem["tol"],
+        "ipopt.max_iter": 500,
+        "ipopt.bound_relax_factor": 0.0,
+    }
     mpc.set_param(
-        n_horizon=problem["horizon"], n_robust=problem["robust_horizon"], t_step=dt, nlpsol_opts=options, store_full_solution=False
+        n_horizon=problem["horizon"],
+        n_robust=problem["robust_horizon"],
+        t_step=dt,
+        nlpsol_opts=options,
+        store_full_solution=False,
     )
     if not discrete:
-        mpc.set_param(state_discretization="collocation", collocation_type="radau", collocation_deg=problem["degree"], collocation_ni=1)
-    goal, error = np.array(problem["goal"]), plant.goal_error(x[plant.GOAL_INDEX], np.array(problem["goal"]), ca)
+        mpc.set_param(
+            state_discretization="collocation",
+            collocation_type="radau",
+            collocation_deg=problem["degree"],
+            collocation_ni=1,
+        )
+    goal, error = (
+        np.array(problem["goal"]),
+        plant.goal_error(x[plant.GOAL_INDEX], np.array(problem["goal"]), ca),
+    )
     stage = ca.sumsqr(error)
     if problem["sigma2"]:
         stage = -ca.exp(-stage / (2 * problem["sigma2"]))
@@ -104,8 +134,10 @@ def build(problem):
         terminal = -value(x, goal)
     mpc.set_objective(lterm=stage, mterm=terminal)
     mpc.set_rterm(**problem["change_weight"])
-    for names, kind, scale in ((plant.STATE_NAMES, "_x", (plant.INIT_HIGH - plant.INIT_LOW) / 2),
-                               (plant.ACTION_NAMES, "_u", problem["u_scale"])):  # fmt: skip
+    for names, kind, scale in (
+        (plant.STATE_NAMES, "_x", (plant.INIT_HIGH - plant.INIT_LOW) / 2),
+        (plant.ACTION_NAMES, "_u", problem["u_scale"]),
+    ):
         for name, value in zip(names, scale):
             mpc.scaling[kind, name] = value
     for i, name in enumerate(plant.ACTION_NAMES):
@@ -154,8 +186,16 @@ def serve(mpc, last_objective):
         u = mpc.make_step(x)
         milliseconds = 1e3 * (time.perf_counter() - tick)
         stats = mpc.solver_stats
-        answer({"u": u.ravel().tolist(), "ms": milliseconds, "success": bool(stats["success"]), "status": str(stats["return_status"]),
-                "iterations": int(stats["iter_count"]), "objective": last_objective()})  # fmt: skip
+        answer(
+            {
+                "u": u.ravel().tolist(),
+                "ms": milliseconds,
+                "success": bool(stats["success"]),
+                "status": str(stats["return_status"]),
+                "iterations": int(stats["iter_count"]),
+                "objective": last_objective(),
+            }
+        )
 
 
 if __name__ == "__main__":

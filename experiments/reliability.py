@@ -75,11 +75,29 @@ FAULTS = {  # case: controllers that it can befall
     "goal out of reach": list(CONTROLLERS),
 }
 LASTING = ("goal out of reach", "stopped early, always")  # not at single steps
-ANSWERS = {"solved": "planned", "retry": "planned", "plan": "fell_back", "hold": "held"}  # rungs of goal_mpc.py
+ANSWERS = {
+    "solved": "planned",
+    "retry": "planned",
+    "plan": "fell_back",
+    "hold": "held",
+}  # rungs of goal_mpc.py
 STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 1,000
 CELL = 500  # steps
-COUNTS = ("faults", "refused", "wrong", "cost_rose", "chances", "recovered", "planned", "fell_back", "held", "qp_unsolved")
-TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")  # columns that may differ from run to run
+COUNTS = (
+    "faults",
+    "refused",
+    "wrong",
+    "cost_rose",
+    "chances",
+    "recovered",
+    "planned",
+    "fell_back",
+    "held",
+    "qp_unsolved",
+)
+TIMES = re.compile(
+    r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$"
+)  # columns that may differ from run to run
 
 
 @dataclass
@@ -139,7 +157,9 @@ def spoil(controller, case, x, rng):
         return np.where(bad, rng.choice([np.nan, np.inf, -np.inf]), x)
     if case == "state far outside":
         reach = 10.0 ** rng.uniform(1, 12)
-        return x + reach * rng.uniform(-1, 1, size=x.shape) * (controller.plant.INIT_HIGH - controller.plant.INIT_LOW)
+        return x + reach * rng.uniform(-1, 1, size=x.shape) * (
+            controller.plant.INIT_HIGH - controller.plant.INIT_LOW
+        )
     if case == "plan not finite" and controller.plan is not None:
         if isinstance(controller.plan, tuple):  # goal_mpc.py: with multipliers of bounds and of constraints
             plan = controller.plan[0].copy()
@@ -205,7 +225,9 @@ def closed_loop(cell):
             counts[answered(controller)] += 1
             counts["cost_rose"] += not stats.get("cost", 0.0) <= stats.get("guess_cost", np.inf)  # nor is nan
             counts["qp_unsolved"] += stats.get("stop") == "unsolved"
-            counts["wrong"] += not (np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all())
+            counts["wrong"] += not (
+                np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all()
+            )
             x = plant.step(x, u, psi)
         if lasting:  # a last step without it
             stop(controller, None, early, usual)
@@ -213,7 +235,10 @@ def closed_loop(cell):
             controller.make_step(x)
             counts.update(chances=1, recovered=int(answered(controller) == "planned"))
     stop(controller, None, early, usual)
-    return [{"case": case, "controller": name, "steps": counts["planned"] + counts["fell_back"] + counts["held"]} | dict(counts)]
+    return [
+        {"case": case, "controller": name, "steps": counts["planned"] + counts["fell_back"] + counts["held"]}
+        | dict(counts)
+    ]
 
 
 def controllers(args):
@@ -222,25 +247,56 @@ def controllers(args):
         for case in (case for case in FAULTS if name in FAULTS[case]):
             steps = 10 if args.quick else STEPS.get((case, name), 1_000)
             rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
-    inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(gm.__file__), Path(deploy.__file__)]
+    inputs = [
+        Path(__file__),
+        *sorted((ROOT / "envs").rglob("*.py")),
+        Path(gm.__file__),
+        Path(deploy.__file__),
+    ]
     total = {}
     for row in cells.collect(closed_loop, rounds, args.jobs, args.runs, inputs):
         counts = total.setdefault((row["case"], row["controller"]), collections.Counter())
         counts.update({key: int(value) for key, value in row.items() if key not in ("case", "controller")})
-    return [{"case": case, "controller": name} | dict(total[case, name]) for case in FAULTS for name in FAULTS[case]]
+    return [
+        {"case": case, "controller": name} | dict(total[case, name])
+        for case in FAULTS
+        for name in FAULTS[case]
+    ]
 
 
 # Training
 
 
-TRAINING = ["--env", "cstr", "--hidden", "16", "16", "--total-timesteps", "19200", "--learning-starts", "320", "--eval-every", "1600",
-            "--eval-episodes", "20", "--save-every", "160", "--buffer-size", "3200"]  # fmt: skip
+TRAINING = [
+    "--env",
+    "cstr",
+    "--hidden",
+    "16",
+    "16",
+    "--total-timesteps",
+    "19200",
+    "--learning-starts",
+    "320",
+    "--eval-every",
+    "1600",
+    "--eval-episodes",
+    "20",
+    "--save-every",
+    "160",
+    "--buffer-size",
+    "3200",
+]
 
 
 def train(*arguments, kill_after=None):
     """The training script in a process of its own, killed after some seconds unless it has finished. Returns whether it finished."""
-    process = subprocess.Popen([sys.executable, "sac_her_branching.py", *map(str, arguments)], cwd=ROOT, stdout=subprocess.DEVNULL,
-                               stderr=subprocess.PIPE, text=True)  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "sac_her_branching.py", *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         _, error = process.communicate(timeout=kill_after)
     except subprocess.TimeoutExpired:
@@ -255,7 +311,9 @@ def train(*arguments, kill_after=None):
 def equal(a, b):
     """Whether nested plain data and tensors are the same, bit for bit, but for times and folders."""
     if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a if k not in ("seconds", "train_seconds", "out"))
+        return a.keys() == b.keys() and all(
+            equal(a[k], b[k]) for k in a if k not in ("seconds", "train_seconds", "out")
+        )
     if isinstance(a, (list, tuple)):
         return len(a) == len(b) and all(map(equal, a, b))
     return torch.equal(a, b) if torch.is_tensor(a) else a == b or (a != a and b != b)
@@ -264,7 +322,10 @@ def equal(a, b):
 def killed(cell):
     """Trainings killed at random moments, until so many kills have come about; each end is compared with that of one that was not."""
     branches, kills, seed = cell
-    rng, counts = np.random.default_rng(seed), collections.Counter({key: 0 for key in ("kills", "half", "mid_write", "ends", "same")})
+    rng, counts = (
+        np.random.default_rng(seed),
+        collections.Counter({key: 0 for key in ("kills", "half", "mid_write", "ends", "same")}),
+    )
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         start, runs = [*TRAINING, "--branches", branches, "--seed", seed, "--out"], folder / "killed"
@@ -277,11 +338,21 @@ def killed(cell):
             while not finished:
                 saved = list(runs.glob("*/resume.pt"))
                 arguments = ["--resume", saved[0]] if saved else [*start, runs]
-                finished = train(*arguments, kill_after=rng.uniform(0.3, 0.9) * seconds if counts["kills"] < kills else None)
+                finished = train(
+                    *arguments,
+                    kill_after=rng.uniform(0.3, 0.9) * seconds if counts["kills"] < kills else None,
+                )
                 if not finished:
-                    counts.update(kills=1, mid_write=int(any(runs.glob("*/*.tmp"))), half=int(not all(map(whole, runs.glob("*/*.pt")))))
+                    counts.update(
+                        kills=1,
+                        mid_write=int(any(runs.glob("*/*.tmp"))),
+                        half=int(not all(map(whole, runs.glob("*/*.pt")))),
+                    )
             ends = [next(place.glob("*/resume.pt")).parent for place in (folder / "whole", runs)]
-            same = all(equal(*(torch.load(end / name, weights_only=True) for end in ends)) for name in ("resume.pt", "checkpoint.pt"))
+            same = all(
+                equal(*(torch.load(end / name, weights_only=True) for end in ends))
+                for name in ("resume.pt", "checkpoint.pt")
+            )
             tables = [without_times(end / "evaluations.csv") for end in ends]
             counts.update(ends=1, same=int(same and tables[0] == tables[1]))
     return [{"branches": branches} | dict(counts)]
@@ -300,9 +371,19 @@ def training(args):
     parts = [(branches, 1 if args.quick else 30, seed) for seed, branches in enumerate((1, 4))]
     inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(sac.__file__)]
     found = cells.collect(killed, parts, args.jobs, args.runs, inputs)
-    kills, half, mid_write, ends, same = (sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write", "ends", "same"))
-    return [result("training", "SIGKILL: what was saved is whole", kills, kills - half, f"{mid_write} of them while a file was written"),
-            result("training", "killed and resumed: equal to an uninterrupted run", ends, same)]  # fmt: skip
+    kills, half, mid_write, ends, same = (
+        sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write", "ends", "same")
+    )
+    return [
+        result(
+            "training",
+            "SIGKILL: what was saved is whole",
+            kills,
+            kills - half,
+            f"{mid_write} of them while a file was written",
+        ),
+        result("training", "killed and resumed: equal to an uninterrupted run", ends, same),
+    ]
 
 
 def result(study, case, trials, held, detail=""):
@@ -356,7 +437,13 @@ def hostile(data, rng, tries):
             value = value if not isinstance(value, list) else [float(v) for v in value]
             yield "entries missing or of another type", stored(data | {key: value})
     for key, value in data["scaling"].items():
-        for changed in (value[:-1], [float("nan")] * len(value), [0.0] * len(value), None, [10**6] * len(value)):
+        for changed in (
+            value[:-1],
+            [float("nan")] * len(value),
+            [0.0] * len(value),
+            None,
+            [10**6] * len(value),
+        ):
             yield "scaling damaged", stored(data | {"scaling": data["scaling"] | {key: changed}})
 
 
@@ -375,7 +462,9 @@ def read(load, path):
     if isinstance(agent, sac.Policy):
         value = agent.value(agent.plant.START, agent.plant.EVAL_GOAL)
     else:
-        value = torch_value(agent, *(torch.from_numpy(v)[None] for v in (agent.plant.START, agent.plant.EVAL_GOAL))).numpy()
+        value = torch_value(
+            agent, *(torch.from_numpy(v)[None] for v in (agent.plant.START, agent.plant.EVAL_GOAL))
+        ).numpy()
     return collections.Counter(["loaded" if np.isfinite(value).all() else "wrong"])
 
 
@@ -393,8 +482,16 @@ def checkpoints(args):
             file.truncate(2 * MAX_CHECKPOINT_BYTES)
         for load in LOADERS:
             counts["larger than a gigabyte"] += read(load, path)
-    return [result("checkpoints", case, sum(found.values()), found["refused"] + found["loaded"], f"{found['loaded']} of them loaded")
-            for case, found in counts.items()]  # fmt: skip
+    return [
+        result(
+            "checkpoints",
+            case,
+            sum(found.values()),
+            found["refused"] + found["loaded"],
+            f"{found['loaded']} of them loaded",
+        )
+        for case, found in counts.items()
+    ]
 
 
 # Many deployments
@@ -410,7 +507,9 @@ def deployments(args):
         for _ in range(steps):
             x = controller.plant.step(x, controller.make_step(x), psi)
         if i + 1 in (most // 10, most):
-            sizes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e3 if sys.platform == "linux" else 1e6))
+            sizes.append(
+                resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e3 if sys.platform == "linux" else 1e6)
+            )
     grown = sizes[1] - sizes[0]
     detail = f"{sizes[0]:.0f} MB at the most up to {most // 10}, {sizes[1]:.0f} MB up to {most}"
     return [result("deployments", "memory grows by less than 10 MB", most, most * (grown < 10), detail)]
@@ -444,13 +543,20 @@ def determinism(args):
         out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         if out.returncode:
             raise RuntimeError(out.stderr)
-        found[processes] = {path.name: without_times(path) for path in sorted((folder / "results").glob("*.csv"))}
-        found[processes] |= {path.name: torch.load(path, weights_only=True) for path in sorted((folder / "pretrained").glob("*.pt"))}
+        found[processes] = {
+            path.name: without_times(path) for path in sorted((folder / "results").glob("*.csv"))
+        }
+        found[processes] |= {
+            path.name: torch.load(path, weights_only=True)
+            for path in sorted((folder / "pretrained").glob("*.pt"))
+        }
     rows = []
     for kind, case in ((".csv", "tables: the same but for times"), (".pt", "critics: the same weights")):
         names = sorted(name for name in set(found[1]) | set(found[2]) if name.endswith(kind))
         different = [name for name in names if not equal(found[1].get(name), found[2].get(name))]
-        rows.append(result("determinism", case, len(names), len(names) - len(different), ", ".join(different)))
+        rows.append(
+            result("determinism", case, len(names), len(names) - len(different), ", ".join(different))
+        )
     return rows
 
 
@@ -459,8 +565,13 @@ def main(args):
     cells.check(args, table, jobs=(1, 1024))
     args.runs.mkdir(parents=True, exist_ok=True)
     if not args.plot_only:
-        study = {"controllers": controllers, "training": training, "checkpoints": checkpoints, "deployments": deployments,
-                 "determinism": determinism}[args.study]  # fmt: skip
+        study = {
+            "controllers": controllers,
+            "training": training,
+            "checkpoints": checkpoints,
+            "deployments": deployments,
+            "determinism": determinism,
+        }[args.study]
         cells.write(study(args), args.out / "results" / table)
     for row in cells.read(args.out / "results" / table):
         print("  ".join(f"{key} {value}" for key, value in row.items()))

@@ -51,7 +51,13 @@ class Step:
 
 def experiment(script, study=None, minutes=1.0, needs=(), alone=False):
     name = f"{script}_{study}" if study else script
-    return Step(name, (f"experiments/{script}.py", *(("--study", study) if study else ())), minutes, tuple(needs), alone)
+    return Step(
+        name,
+        (f"experiments/{script}.py", *(("--study", study) if study else ())),
+        minutes,
+        tuple(needs),
+        alone,
+    )
 
 
 def training(name, *arguments, minutes=1.0):
@@ -152,15 +158,24 @@ def run(step, args):
     command = [sys.executable, *step.command]
     if step.name.startswith("critic_"):
         trained = args.runs / f"critics/{step.name}_{os.getpid()}"
-        command += ["--out", str(trained), *(["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else [])]
+        command += [
+            "--out",
+            str(trained),
+            *(["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else []),
+        ]
     else:
         command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
         command += [] if script in ONE_AT_A_TIME else ["--jobs", str(args.step_jobs)]
         shared = (
-            "cstr_loops" if script.startswith("cstr_") and script not in ("cstr_offline", "cstr_training", "cstr_offset_free") else script
+            "cstr_loops"
+            if script.startswith("cstr_")
+            and script not in ("cstr_offline", "cstr_training", "cstr_offset_free")
+            else script
         )
         command += [] if script in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    result = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
     if result.returncode:
         return step.name, f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
     if step.name.startswith("critic_"):
@@ -214,7 +229,9 @@ def main(args, steps=STEPS):
         cells.fail("--backend dask and --scheduler ADDRESS belong together")
     args.out = args.out or (ROOT / "runs/quick" if args.quick else HERE)
     if args.quick and args.out.resolve() == HERE:
-        cells.fail("--quick would replace the committed results by those of tiny budgets; name another folder with --out")
+        cells.fail(
+            "--quick would replace the committed results by those of tiny budgets; name another folder with --out"
+        )
     args.runs, args.out = args.runs.absolute(), args.out.absolute()
     try:
         steps = wanted(steps, args.only)
@@ -230,7 +247,9 @@ def main(args, steps=STEPS):
         for step in steps:
             state = "done" if note(step, args).exists() else f"{step.minutes:g} min"
             needs = "the reactor's critics" if step.needs == CRITICS else ", ".join(step.needs)
-            print(f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else '':7s}{'needs ' + needs if needs else ''}")
+            print(
+                f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else '':7s}{'needs ' + needs if needs else ''}"
+            )
         left = [step for step in steps if not note(step, args).exists()]
         hours = sum(step.minutes / (1 if step.alone else args.jobs) for step in left) / 60
         print(f"minutes of one process; about {hours:.1f} hours are left with --jobs {args.jobs}")
@@ -245,10 +264,14 @@ def main(args, steps=STEPS):
             cells.fail(f"--scheduler {args.scheduler} does not answer ({error})")
         settings = dict(backend="dask")
     minutes, failed = {step.name: step.minutes for step in steps}, []
-    with tqdm(total=sum(minutes.values()), disable=None, bar_format="{l_bar}{bar}| {remaining} left{postfix}") as bar:
+    with tqdm(
+        total=sum(minutes.values()), disable=None, bar_format="{l_bar}{bar}| {remaining} left{postfix}"
+    ) as bar:
         for wave in waves(steps):
             with joblib.parallel_config(**settings):
-                results = joblib.Parallel(return_as="generator_unordered")(joblib.delayed(run)(step, args) for step in wave)
+                results = joblib.Parallel(return_as="generator_unordered")(
+                    joblib.delayed(run)(step, args) for step in wave
+                )
                 for name, error in results:
                     bar.set_postfix_str(f", {name} {'failed' if error else 'done'}")
                     bar.update(minutes[name])

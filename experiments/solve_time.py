@@ -110,7 +110,11 @@ def where(args):
     rows = []
     for label, (name, options) in CONTROLLERS.items():
         options |= {"compile": not args.quick}
-        mpc = pendulum(**options) if name == "pendulum" else deploy.build_controller(name, deploy.Args(**options))
+        mpc = (
+            pendulum(**options)
+            if name == "pendulum"
+            else deploy.build_controller(name, deploy.Args(**options))
+        )
         spent, plant = clocked(mpc), mpc.plant
         starts, psi = deploy.draws(plant, args.episodes, args.seed)
         log = []
@@ -122,13 +126,27 @@ def where(args):
                 log.append(mpc.stats)
         milliseconds = np.array([stats["wall_ms"] for stats in log])
         n = len(log)
-        row = {"controller": label, "nodes": len(mpc.tree.stage), "steps": n, "step_ms_mean": milliseconds.mean()}
-        row |= {f"step_ms_{key}": np.quantile(milliseconds, q) for key, q in (("median", 0.5), ("p95", 0.95), ("p999", 0.999), ("max", 1))}
+        row = {
+            "controller": label,
+            "nodes": len(mpc.tree.stage),
+            "steps": n,
+            "step_ms_mean": milliseconds.mean(),
+        }
+        row |= {
+            f"step_ms_{key}": np.quantile(milliseconds, q)
+            for key, q in (("median", 0.5), ("p95", 0.95), ("p999", 0.999), ("max", 1))
+        }
         # of the quadratic programs: in a step, and interior-point iterations of each
-        row |= {"iterations_mean": spent["programs"] / n, "qp_iterations_mean": spent["qp_iterations"] / spent["programs"]}
+        row |= {
+            "iterations_mean": spent["programs"] / n,
+            "qp_iterations_mean": spent["qp_iterations"] / spent["programs"],
+        }
         row |= {key: spent[key] / n for key in list(PARTS)[:-1]}
         row["python_ms"] = row["step_ms_mean"] - sum(row[key] for key in list(PARTS)[:-1])
-        rows.append({k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()} | {"machine": cells.machine()})
+        rows.append(
+            {k: round(float(v), 4) if isinstance(v, float) else v for k, v in row.items()}
+            | {"machine": cells.machine()}
+        )
     return rows
 
 
@@ -164,9 +182,18 @@ def scaling(args):
     rows = []
     for (axis, n, k), (mpc, _, log) in zip(todo, planners):
         ms, iterating, iterations = np.transpose(log)
-        rows.append({"axis": axis, "horizon": n, "scenarios": k * k, "nodes": len(mpc.tree.stage) - 1, "ms_median": round(np.median(ms), 3),
-                     "iterations_median": np.median(iterations), "ms_per_iteration": round(np.median(iterating / iterations), 4),
-                     "machine": cells.machine()})  # fmt: skip
+        rows.append(
+            {
+                "axis": axis,
+                "horizon": n,
+                "scenarios": k * k,
+                "nodes": len(mpc.tree.stage) - 1,
+                "ms_median": round(np.median(ms), 3),
+                "iterations_median": np.median(iterations),
+                "ms_per_iteration": round(np.median(iterating / iterations), 4),
+                "machine": cells.machine(),
+            }
+        )
     return rows
 
 
@@ -183,11 +210,18 @@ def plot(where_rows, scaling_rows, path):
         for key, (label, colour) in PARTS.items():
             axes[0].barh(y, float(row[key]), left=left, color=colour, label=label if y == 0 else None)
             left += float(row[key])
-        axes[0].annotate(f"{left:.1f}", (left, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9)
+        axes[0].annotate(
+            f"{left:.1f}", (left, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9
+        )
     axes[0].set_yticks(range(len(where_rows)), [row["controller"] for row in where_rows], fontsize=9)
     axes[0].invert_yaxis()
-    axes[0].set(xlabel="mean time of a step [ms]", xlim=(0, 1.16 * max(float(row["step_ms_mean"]) for row in where_rows)))
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=9)
+    axes[0].set(
+        xlabel="mean time of a step [ms]",
+        xlim=(0, 1.16 * max(float(row["step_ms_mean"]) for row in where_rows)),
+    )
+    fig.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=9
+    )
     for ax, axis in zip(axes[1:], ("horizon", "scenarios")):
         mine = [row for row in scaling_rows if row["axis"] == axis]
         x, y = (np.array([float(row[key]) for row in mine]) for key in (axis, "ms_per_iteration"))
@@ -214,19 +248,28 @@ def main(args):
             args = replace(args, episodes=2, steps=3)
         cells.write(where(args), args.out / "results/solve_time_where.csv")
         cells.write(scaling(args), args.out / "results/solve_time_scaling.csv")
-    where_rows, scaling_rows = (cells.read(args.out / f"results/solve_time_{name}.csv") for name in ("where", "scaling"))
+    where_rows, scaling_rows = (
+        cells.read(args.out / f"results/solve_time_{name}.csv") for name in ("where", "scaling")
+    )
     print(
         f"{'':44s}{'step, ms: mean  median     p95   99.9 %     max':48s}  SQP, QP iterations  "
         + "  ".join(label for label, _ in PARTS.values())
     )
     for row in where_rows:
-        step = "".join(f"{float(row[f'step_ms_{key}']):9.2f}" for key in ("mean", "median", "p95", "p999", "max"))
+        step = "".join(
+            f"{float(row[f'step_ms_{key}']):9.2f}" for key in ("mean", "median", "p95", "p999", "max")
+        )
         parts = "".join(f"{float(row[key]):9.2f}" for key in PARTS)
-        print(f"{row['controller']:44s}{step}{float(row['iterations_mean']):9.1f}{float(row['qp_iterations_mean']):6.1f}   {parts}")
+        print(
+            f"{row['controller']:44s}{step}{float(row['iterations_mean']):9.1f}{float(row['qp_iterations_mean']):6.1f}   {parts}"
+        )
     for axis in ("horizon", "scenarios"):
         mine = [row for row in scaling_rows if row["axis"] == axis]
-        print(f"{axis}: " + ", ".join(f"{row[axis]}: {float(row['ms_per_iteration']):.2f}" for row in mine)
-              + f" ms per iteration; exponent {exponent(mine, axis):.2f}")  # fmt: skip
+        print(
+            f"{axis}: "
+            + ", ".join(f"{row[axis]}: {float(row['ms_per_iteration']):.2f}" for row in mine)
+            + f" ms per iteration; exponent {exponent(mine, axis):.2f}"
+        )
     plot(where_rows, scaling_rows, args.out / "figures/solve_time.png")
 
 

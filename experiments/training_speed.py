@@ -85,12 +85,24 @@ def ours(cell):
     """Evaluations of one run of sac_her_branching.py, in a process of its own."""
     variant, seed, quick = cell
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(HERE.parent / "sac_her_branching.py"), "--seed", str(seed), "--save-every", "0", "--out", folder]
+        command = [
+            sys.executable,
+            str(HERE.parent / "sac_her_branching.py"),
+            "--seed",
+            str(seed),
+            "--save-every",
+            "0",
+            "--out",
+            folder,
+        ]
         command += VARIANTS[variant]
         if quick:
             command += ["--total-timesteps", "2000", "--eval-every", "1000", "--eval-episodes", "20"]
         subprocess.run(command, check=True, capture_output=True)
-        return [{"variant": variant, "seed": seed} | row for row in cells.read(next(Path(folder).glob("*/evaluations.csv")))]
+        return [
+            {"variant": variant, "seed": seed} | row
+            for row in cells.read(next(Path(folder).glob("*/evaluations.csv")))
+        ]
 
 
 def peer(cell):
@@ -119,7 +131,11 @@ def peer(cell):
             if self.num_timesteps >= self.due:
                 seconds = time.perf_counter() - self.tick
                 row = evaluation_row(self, 20 if quick else 200)
-                updates = {"step": self.num_timesteps, "updates": self.model._n_updates, "train_seconds": round(seconds, 2)}
+                updates = {
+                    "step": self.num_timesteps,
+                    "updates": self.model._n_updates,
+                    "train_seconds": round(seconds, 2),
+                }
                 self.rows.append({"variant": variant, "seed": seed} | updates | row)
                 self.due += every
                 self.tick = time.perf_counter() - seconds
@@ -128,20 +144,38 @@ def peer(cell):
         plant = cstr
 
         def act(self, x, goal):
-            obs = {"observation": x, "achieved_goal": x[:, cstr.GOAL_INDEX], "desired_goal": np.broadcast_to(goal, (len(x), len(goal)))}
+            obs = {
+                "observation": x,
+                "achieved_goal": x[:, cstr.GOAL_INDEX],
+                "desired_goal": np.broadcast_to(goal, (len(x), len(goal))),
+            }
             return self.model.predict(obs, deterministic=True)[0]
 
     variant, seed, quick = cell
     torch.set_num_threads(1)
     settings, every, total = PEERS[variant], 1_000 if quick else 10_000, 2_000 if quick else 100_000
     start, end = settings["learning_rate"], settings["end"]
-    first = max(1_000, settings["num_envs"] * (cstr.EPISODE_STEPS + 1))  # its replay needs a whole episode of each plant
+    first = max(
+        1_000, settings["num_envs"] * (cstr.EPISODE_STEPS + 1)
+    )  # its replay needs a whole episode of each plant
     vec = make_vec_env(functools.partial(gym.make, cstr.ENV_ID), settings["num_envs"], seed=seed)
     # the same networks, discount, batch, share of hindsight goals and buffer as sac_her_branching.py
-    model = SAC("MultiInputPolicy", vec, learning_rate=lambda left: start * (end + (1 - end) * left), buffer_size=200_000,
-                learning_starts=first, batch_size=256, tau=settings["tau"], gamma=0.99, gradient_steps=settings["updates"], seed=seed,
-                replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(n_sampled_goal=4, goal_selection_strategy="future"),
-                policy_kwargs=dict(net_arch=[64, 64], activation_fn=nn.SiLU, features_extractor_class=Features), device="cpu")  # fmt: skip
+    model = SAC(
+        "MultiInputPolicy",
+        vec,
+        learning_rate=lambda left: start * (end + (1 - end) * left),
+        buffer_size=200_000,
+        learning_starts=first,
+        batch_size=256,
+        tau=settings["tau"],
+        gamma=0.99,
+        gradient_steps=settings["updates"],
+        seed=seed,
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs=dict(n_sampled_goal=4, goal_selection_strategy="future"),
+        policy_kwargs=dict(net_arch=[64, 64], activation_fn=nn.SiLU, features_extractor_class=Features),
+        device="cpu",
+    )
     callback = Evaluate()
     model.learn(total, callback=callback)
     return callback.rows
@@ -177,7 +211,9 @@ def profile(args):
     def actor():
         agent.optimisers["actor"].zero_grad()
         action, log_prob = agent.actor.sample(features, agent.generator)
-        (log_prob - agent.critic(features, action).amin(0)).mean().backward(inputs=list(agent.actor.parameters()))
+        (log_prob - agent.critic(features, action).amin(0)).mean().backward(
+            inputs=list(agent.actor.parameters())
+        )
 
     def targets():
         with torch.no_grad():
@@ -185,7 +221,9 @@ def profile(args):
 
     def averages():
         with torch.no_grad():
-            torch._foreach_lerp_(list(agent.target.parameters()), list(agent.critic.parameters()), settings.tau)
+            torch._foreach_lerp_(
+                list(agent.target.parameters()), list(agent.critic.parameters()), settings.tau
+            )
 
     parts = {
         "replay with hindsight": lambda: buffer.sample(settings.batch_size, agent.generator),
@@ -195,11 +233,14 @@ def profile(args):
         "target networks": averages,
         "actor, forward and backward": actor,
         "actor, Adam": agent.optimisers["actor"].step,
-        "whole update": lambda: (buffer.sample(settings.batch_size, agent.generator), agent.update_critic(x, u, goal, x_next),
-                                 agent.update_actor(x, goal)),
+        "whole update": lambda: (
+            buffer.sample(settings.batch_size, agent.generator),
+            agent.update_critic(x, u, goal, x_next),
+            agent.update_actor(x, goal),
+        ),
         "exploring actions": lambda: agent.explore(obs["observation"], obs["desired_goal"]),
         "step of all plants and storing": add,
-    }  # fmt: skip
+    }
     rows, updates = [], settings.num_envs / settings.steps_per_update
     for name, part in parts.items():
         times = []
@@ -208,16 +249,32 @@ def profile(args):
             part()
             times.append(1e3 * (time.perf_counter() - tick))
         per_step = name in ("exploring actions", "step of all plants and storing")
-        share = np.median(times) * (1 if per_step else updates) * settings.total_timesteps / settings.num_envs / 1e3
-        rows.append({"part": name, "ms_median": round(np.median(times), 4), "ms_p95": round(np.quantile(times, 0.95), 4),
-                     "seconds_in_a_run": round(share, 2), "machine": cells.machine()})  # fmt: skip
+        share = (
+            np.median(times)
+            * (1 if per_step else updates)
+            * settings.total_timesteps
+            / settings.num_envs
+            / 1e3
+        )
+        rows.append(
+            {
+                "part": name,
+                "ms_median": round(np.median(times), 4),
+                "ms_p95": round(np.quantile(times, 0.95), 4),
+                "seconds_in_a_run": round(share, 2),
+                "machine": cells.machine(),
+            }
+        )
         print(f"{name:32s} {rows[-1]['ms_median']:8.3f} ms   {share:6.2f} s of a run")
     cells.write(rows, args.out / "results/training_speed_profile.csv")
 
 
 def time_to(rows, quality):
     """Training seconds at the first evaluation of a run with at most this robust median error, infinite if there is none."""
-    return min((float(row["train_seconds"]) for row in rows if float(row["robust_median_ape"]) <= quality), default=np.inf)
+    return min(
+        (float(row["train_seconds"]) for row in rows if float(row["robust_median_ape"]) <= quality),
+        default=np.inf,
+    )
 
 
 def runs_of(rows):
@@ -229,24 +286,34 @@ def runs_of(rows):
 
 
 def table(rows):
-    print(f"{'':36s}  robust error %     nominal  seconds  transitions  runs that reach {', '.join(map(str, QUALITIES))} %")
+    print(
+        f"{'':36s}  robust error %     nominal  seconds  transitions  runs that reach {', '.join(map(str, QUALITIES))} %"
+    )
     print(f"{'':36s}  IQM [min, max]         IQM   median  per second   (median seconds of those)")
     for variant, runs in runs_of(rows).items():
-        robust, nominal, seconds = (np.array([float(run[-1][key]) for run in runs]) for key in
-                                    ("robust_median_ape", "nominal_median_ape", "train_seconds"))  # fmt: skip
+        robust, nominal, seconds = (
+            np.array([float(run[-1][key]) for run in runs])
+            for key in ("robust_median_ape", "nominal_median_ape", "train_seconds")
+        )
         reached = []
         for quality in QUALITIES:
             times = np.array([time_to(run, quality) for run in runs])
             done = np.isfinite(times)
-            reached.append(f"{done.sum()} of {len(runs)}" + (f" ({np.median(times[done]):.0f})" if done.any() else ""))
+            reached.append(
+                f"{done.sum()} of {len(runs)}" + (f" ({np.median(times[done]):.0f})" if done.any() else "")
+            )
         speed = np.median([float(run[-1]["step"]) / float(run[-1]["train_seconds"]) for run in runs])
-        print(f"{variant:36s}  {trim_mean(robust, 0.25):.2f} [{robust.min():.2f}, {robust.max():.2f}]  {trim_mean(nominal, 0.25):6.2f}  "
-              f"{np.median(seconds):7.1f}  {speed:11.0f}  {', '.join(reached)}")  # fmt: skip
+        print(
+            f"{variant:36s}  {trim_mean(robust, 0.25):.2f} [{robust.min():.2f}, {robust.max():.2f}]  {trim_mean(nominal, 0.25):6.2f}  "
+            f"{np.median(seconds):7.1f}  {speed:11.0f}  {', '.join(reached)}"
+        )
 
 
 def plot(args):
     """Robust error against training time: every variant's end on the left, the curves of ours and of Stable-Baselines3 on the right."""
-    ablation, peers = (cells.read(args.out / f"results/training_speed_{name}.csv") for name in ("ablation", "peer"))
+    ablation, peers = (
+        cells.read(args.out / f"results/training_speed_{name}.csv") for name in ("ablation", "peer")
+    )
     fig, axes = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     runs = runs_of(ablation)
     for y, (variant, mine) in enumerate(runs.items()):
@@ -254,20 +321,36 @@ def plot(args):
         colour = "#0072B2" if variant == "default" else "#999999"
         axes[0].plot(robust, [y] * len(robust), "o", color=colour, ms=4, alpha=0.7)
         axes[0].plot(trim_mean(robust, 0.25), y, "|", color="black", ms=14, mew=2)
-    seconds = {variant: np.median([float(run[-1]["train_seconds"]) for run in mine]) for variant, mine in runs.items()}
-    axes[0].set_yticks(range(len(runs)), [f"{variant}  ({seconds[variant]:.0f} s)" for variant in runs], fontsize=8)
+    seconds = {
+        variant: np.median([float(run[-1]["train_seconds"]) for run in mine])
+        for variant, mine in runs.items()
+    }
+    axes[0].set_yticks(
+        range(len(runs)), [f"{variant}  ({seconds[variant]:.0f} s)" for variant in runs], fontsize=8
+    )
     axes[0].invert_yaxis()
-    axes[0].set(xlabel="robust error at the end of a run [%]", title="dots: seeds, bar: interquartile mean; median time")
+    axes[0].set(
+        xlabel="robust error at the end of a run [%]",
+        title="dots: seeds, bar: interquartile mean; median time",
+    )
     curves = {"default": ("#0072B2", "-", "this repository")}
-    curves |= {name: (colour, dashes, name) for name, colour, dashes in zip(PEERS, ("#D55E00", "#E69F00"), ("--", "-."))}
+    curves |= {
+        name: (colour, dashes, name)
+        for name, colour, dashes in zip(PEERS, ("#D55E00", "#E69F00"), ("--", "-."))
+    }
     for variant, (colour, dashes, name) in curves.items():
         mine = runs_of(ablation + peers).get(variant, [])
         for i, run in enumerate(mine):
             x, y = ([float(row[key]) for row in run] for key in ("train_seconds", "robust_median_ape"))
             axes[1].plot(x, y, color=colour, ls=dashes, lw=1.3, alpha=0.8, label=name if i == 0 else None)
     axes[1].axhline(2.2, color="black", lw=1, ls=":", label="2.2 %")
-    axes[1].set(xscale="log", yscale="log", xlabel="training time on one core [s]", ylabel="robust error [%]",
-                title="a line per seed")  # fmt: skip
+    axes[1].set(
+        xscale="log",
+        yscale="log",
+        xlabel="training time on one core [s]",
+        ylabel="robust error [%]",
+        title="a line per seed",
+    )
     for axis, ticks in ((axes[1].xaxis, (3, 10, 30, 100, 300)), (axes[1].yaxis, (2, 3, 5, 10, 20, 50))):
         axis.set_ticks(ticks, [str(tick) for tick in ticks])
         axis.set_ticks([], minor=True)
@@ -294,7 +377,11 @@ def main(args):
             variants = variants[-1:] if args.study == "peer" else variants[:2]
         seeds = 1 if args.quick else args.seeds if args.study == "ablation" else min(args.seeds, 3)
         todo = [(variant, args.seed + i, args.quick) for i in range(seeds) for variant in variants]
-        inputs = [HERE.parent / "sac_her_branching.py", HERE.parent / "envs/__init__.py", HERE.parent / "envs/cstr.py"]
+        inputs = [
+            HERE.parent / "sac_her_branching.py",
+            HERE.parent / "envs/__init__.py",
+            HERE.parent / "envs/cstr.py",
+        ]
         rows = cells.collect(ours if args.study == "ablation" else peer, todo, args.jobs, args.runs, inputs)
         rows.sort(key=lambda row: (variants.index(row["variant"]), int(row["seed"])))
         cells.write([row | {"jobs": args.jobs, "machine": cells.machine()} for row in rows], result)

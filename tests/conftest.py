@@ -26,7 +26,9 @@ def checkpoint(tmp_path_factory, plant):
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:
-            parameter += 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
+            parameter += (
+                0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
+            )
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt"
     training.save(training.checkpoint(agent, training.plain(args), step=0), path)
     return path
@@ -44,9 +46,19 @@ def reproduction(request, tmp_path_factory):
         yield None
         return
     folder = tmp_path_factory.mktemp("quick")
-    command = [sys.executable, "experiments/reproduce.py", "--quick", "--out", folder, "--runs", folder / "runs"]
+    command = [
+        sys.executable,
+        "experiments/reproduce.py",
+        "--quick",
+        "--out",
+        folder,
+        "--runs",
+        folder / "runs",
+    ]
     with open(folder / "log.txt", "w") as log:
-        process = subprocess.Popen(command, cwd=Path(__file__).parent.parent, stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            command, cwd=Path(__file__).parent.parent, stdout=log, stderr=subprocess.STDOUT
+        )
     yield process, folder
     process.terminate()
 

@@ -33,7 +33,13 @@ COMPILER = any(map(shutil.which, ("gcc", "clang", "cc")))
 
 
 def run_script(*arguments):
-    return subprocess.run([sys.executable, "rl_mpc_deploy.py", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "rl_mpc_deploy.py", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def casadi_stage(plant):
@@ -44,7 +50,9 @@ def casadi_stage(plant):
 
 
 def numpy_stage(plant):
-    return lambda x, g: -np.exp(-np.sum(plant.goal_error(x[plant.GOAL_INDEX], g) ** 2) / (2 * plant.MPC_SIGMA2))
+    return lambda x, g: (
+        -np.exp(-np.sum(plant.goal_error(x[plant.GOAL_INDEX], g) ** 2) / (2 * plant.MPC_SIGMA2))
+    )
 
 
 def of_state(formula):
@@ -53,8 +61,23 @@ def of_state(formula):
     return ca.Function("stage", [x, g], [formula(x)])
 
 
-def mpc(horizon=3, scenarios=cstr.SCENARIOS["mpc"], stage=None, value=None, goal=GOAL, kind=deploy.ScenarioMPC, **options):
-    return kind(cstr, horizon, scenarios, stage or casadi_stage(cstr), value, **dict(goal=goal, compile=False) | options)
+def mpc(
+    horizon=3,
+    scenarios=cstr.SCENARIOS["mpc"],
+    stage=None,
+    value=None,
+    goal=GOAL,
+    kind=deploy.ScenarioMPC,
+    **options,
+):
+    return kind(
+        cstr,
+        horizon,
+        scenarios,
+        stage or casadi_stage(cstr),
+        value,
+        **dict(goal=goal, compile=False) | options,
+    )
 
 
 class Shifted(deploy.ScenarioMPC):
@@ -68,7 +91,9 @@ class Shifted(deploy.ScenarioMPC):
 def solve(controller, x0=X0, iterations=100):
     controller.iterations = iterations
     u = controller.make_step(x0)
-    assert controller.stats["rung"] == "plan" and controller.stats["stop"] in ("stationary", "stalled"), controller.stats
+    assert controller.stats["rung"] == "plan" and controller.stats["stop"] in ("stationary", "stalled"), (
+        controller.stats
+    )
     return controller.stats["cost"], u
 
 
@@ -77,17 +102,36 @@ def close(u, v, share):
     return (np.abs(u - v) <= share * (cstr.U_HIGH - cstr.U_LOW)).all()
 
 
-def written_out(plant, actions, starts, psi, goal, stage, value=None, *, robust_horizon=1, weight=None, price=0.0, change=0.0,
-                u_before=0.0, disturbance=0.0):  # fmt: skip
+def written_out(
+    plant,
+    actions,
+    starts,
+    psi,
+    goal,
+    stage,
+    value=None,
+    *,
+    robust_horizon=1,
+    weight=None,
+    price=0.0,
+    change=0.0,
+    u_before=0.0,
+    disturbance=0.0,
+):
     """States and cost of a plan by the definition of the problem, node by node.
 
     actions: per stage (n_u, nodes); starts, psi, weight: per scenario; goal (n_goal, N). Returns the states x_1 ... x_N, (n_x, nodes) each,
     and the cost.
     """
     S = len(psi) if robust_horizon else 1
-    weight, price = np.full(S, 1 / S) if weight is None else weight, np.broadcast_to(price, (2, len(plant.X_LOW)))
+    weight, price = (
+        np.full(S, 1 / S) if weight is None else weight,
+        np.broadcast_to(price, (2, len(plant.X_LOW))),
+    )
     states, cost = [], 0.0
-    level = [(None, 1.0, 0, u_before)]  # state, weight, scenario and the action before, of each node of a stage
+    level = [
+        (None, 1.0, 0, u_before)
+    ]  # state, weight, scenario and the action before, of each node of a stage
     for t, u in enumerate(actions):
         assert u.shape[1] == len(level)
         following = []
@@ -95,7 +139,10 @@ def written_out(plant, actions, starts, psi, goal, stage, value=None, *, robust_
             cost += w * np.sum(change * (u[:, j] - before) ** 2)
             for i in range(S) if t < robust_horizon else [last]:
                 share = w * (weight[i] if t < robust_horizon else 1.0)
-                after = plant.step(x if t else starts[i], u[:, j], psi[i], substeps=plant.MODEL_SUBSTEPS) + disturbance
+                after = (
+                    plant.step(x if t else starts[i], u[:, j], psi[i], substeps=plant.MODEL_SUBSTEPS)
+                    + disturbance
+                )
                 below, above = np.maximum(plant.X_LOW - after, 0), np.maximum(after - plant.X_HIGH, 0)
                 cost += share * (stage(after, goal[:, t]) + price[0] @ below + price[1] @ above)
                 if value is not None and t == len(actions) - 1:
@@ -120,7 +167,9 @@ def pendulum_checkpoint(tmp_path_factory):
     agent, generator = training.SAC(args, double_pendulum), torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in [*agent.actor.parameters(), *agent.critic.parameters()]:
-            parameter += 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
+            parameter += (
+                0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
+            )
     path = tmp_path_factory.mktemp("pendulum") / "checkpoint.pt"
     training.save(training.checkpoint(agent, training.plain(args), step=0), path)
     return path
@@ -131,7 +180,9 @@ def assert_equals_torch(critic, states, goal):
     V, n_x = deploy.export(critic)[2], len(critic.plant.X_LOW)
     assert check_export(critic, V) < 1e-12
     x = ca.MX.sym("x", n_x)
-    derivatives = ca.Function("derivatives", [x], [V(x, goal), ca.gradient(V(x, goal), x), ca.hessian(V(x, goal), x)[0]])
+    derivatives = ca.Function(
+        "derivatives", [x], [V(x, goal), ca.gradient(V(x, goal), x), ca.hessian(V(x, goal), x)[0]]
+    )
 
     def value(v):
         return torch_value(critic, v[None], torch.tensor(goal)[None])[0]
@@ -139,7 +190,11 @@ def assert_equals_torch(critic, states, goal):
     expanded = expansion(critic)
     for point in states:
         there = torch.tensor(point)
-        expected = value(there), torch.autograd.functional.jacobian(value, there), torch.autograd.functional.hessian(value, there)
+        expected = (
+            value(there),
+            torch.autograd.functional.jacobian(value, there),
+            torch.autograd.functional.hessian(value, there),
+        )
         for mine in (derivatives(point), expanded(point, goal, np.zeros(n_x))):
             for a, b in zip(mine, expected):
                 b = b.detach().numpy()
@@ -148,7 +203,9 @@ def assert_equals_torch(critic, states, goal):
 
 @pytest.mark.parametrize("goal_input", ["error", "goal"])
 @pytest.mark.parametrize("combine", ["min", "first", "mean"])
-def test_export_and_expansion_equal_torch_in_value_gradient_and_hessian(checkpoint, tmp_path, goal_input, combine):
+def test_export_and_expansion_equal_torch_in_value_gradient_and_hessian(
+    checkpoint, tmp_path, goal_input, combine
+):
     data = torch.load(checkpoint, weights_only=True)
     torch.save(data | {"goal_input": goal_input}, tmp_path / "c.pt")
     critic = deploy.load_critic(tmp_path / "c.pt", "cstr", combine)
@@ -159,7 +216,9 @@ def test_export_and_expansion_equal_torch_in_value_gradient_and_hessian(checkpoi
 @pytest.mark.parametrize("combine", ["min", "first", "mean"])
 def test_the_hessian_sees_the_curvature_of_sines_and_cosines(pendulum_checkpoint, combine):
     critic = deploy.load_critic(pendulum_checkpoint, "double_pendulum", combine)
-    assert_equals_torch(critic, envs.sample_states(double_pendulum, np.random.default_rng(1), 5), np.array([0.0, 3.0]))
+    assert_equals_torch(
+        critic, envs.sample_states(double_pendulum, np.random.default_rng(1), 5), np.array([0.0, 3.0])
+    )
 
 
 @pytest.mark.parametrize("part", ["actor", "twins", "scaling"])
@@ -182,7 +241,9 @@ def test_both_scripts_read_a_checkpoint_alike(checkpoint):
     actions = np.array([np.array(mu(s, 0.7)).ravel() for s in x])
     np.testing.assert_allclose(actions, policy.act(x, [0.7]), rtol=1e-3, atol=1e-2)
     np.testing.assert_allclose([float(V(s, 0.7)) for s in x], policy.value(x, [0.7]), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose([float(Q(s, u, 0.7)) for s, u in zip(x, actions)], [float(V(s, 0.7)) for s in x], rtol=1e-12)
+    np.testing.assert_allclose(
+        [float(Q(s, u, 0.7)) for s, u in zip(x, actions)], [float(V(s, 0.7)) for s in x], rtol=1e-12
+    )
 
 
 # The optimal control problem
@@ -190,7 +251,10 @@ def test_both_scripts_read_a_checkpoint_alike(checkpoint):
 
 def test_identical_scenarios_give_the_nominal_controller():
     nominal = solve(mpc(robust_horizon=0))
-    for controller in (mpc(scenarios=np.tile(cstr.PSI_NOMINAL, (3, 1))), mpc(scenarios=cstr.PSI_NOMINAL[None])):
+    for controller in (
+        mpc(scenarios=np.tile(cstr.PSI_NOMINAL, (3, 1))),
+        mpc(scenarios=cstr.PSI_NOMINAL[None]),
+    ):
         cost, u = solve(controller)
         assert cost == pytest.approx(nominal[0], rel=1e-4)
         assert close(u, nominal[1], 0.02)
@@ -214,8 +278,16 @@ def test_every_leaf_counts(robust_horizon, checkpoint):
         return planner.stats["cost"], planner.prediction()
 
     reference, prediction = cost(psi)
-    states, expected = written_out(cstr, prediction["u"], [X0] * 3, psi, np.full((1, 2), GOAL), lambda x, g: 0.0, torch_critic(critic),
-                                   robust_horizon=robust_horizon)  # fmt: skip
+    states, expected = written_out(
+        cstr,
+        prediction["u"],
+        [X0] * 3,
+        psi,
+        np.full((1, 2), GOAL),
+        lambda x, g: 0.0,
+        torch_critic(critic),
+        robust_horizon=robust_horizon,
+    )
     assert reference == pytest.approx(expected, rel=1e-9)
     for scenario in range(3):
         other = psi.copy()
@@ -252,7 +324,10 @@ def test_slack_is_priced_per_physical_unit():
         controller = mpc(1, stage=of_state(lambda x: 0 * x[0]), slack_price=price)
         controller.make_step(x0)
         states = controller.prediction()["x"][0]
-        above, below = np.maximum(states - cstr.X_HIGH[:, None], 0), np.maximum(cstr.X_LOW[:, None] - states, 0)
+        above, below = (
+            np.maximum(states - cstr.X_HIGH[:, None], 0),
+            np.maximum(cstr.X_LOW[:, None] - states, 0),
+        )
         expected = (price[0] @ below + price[1] @ above).mean()
         assert controller.stats["cost"] == pytest.approx(expected, rel=1e-9) and expected > 1
 
@@ -261,7 +336,9 @@ def test_the_first_action_is_shared_and_later_ones_are_not():
     controller = mpc(3)
     first = controller.make_step(X0)
     u = controller.prediction()["u"]
-    assert [a.shape for a in u] == [(2, 1), (2, 9), (2, 9)] and [a.shape for a in controller.prediction()["x"]] == [(4, 9)] * 3
+    assert [a.shape for a in u] == [(2, 1), (2, 9), (2, 9)] and [
+        a.shape for a in controller.prediction()["x"]
+    ] == [(4, 9)] * 3
     np.testing.assert_array_equal(u[0][:, 0], first)
     assert np.ptp(u[1], axis=1).max() > 0
 
@@ -285,11 +362,15 @@ def test_compiled_equals_interpreted(monkeypatch, tmp_path, checkpoint, capsys):
     mu, _, V = deploy.export(critic)
     options = dict(value=V, policy=mu, expansion=expansion(critic))
     fast, slow = mpc(2, compile=True, **options), mpc(2, **options)
-    assert len(list((tmp_path / "rlmpc").iterdir())) == 2  # the functions and the solver of quadratic programs
+    assert (
+        len(list((tmp_path / "rlmpc").iterdir())) == 2
+    )  # the functions and the solver of quadratic programs
     assert "notice" not in capsys.readouterr().err
     for x0 in (X0, X0 + [0.05, 0.02, -2, -2]):
         u, expected = fast.make_step(x0), slow.make_step(x0)
-        assert fast.stats["guess"] == slow.stats["guess"] and fast.stats["guess_cost"] == pytest.approx(slow.stats["guess_cost"], rel=1e-9)
+        assert fast.stats["guess"] == slow.stats["guess"] and fast.stats["guess_cost"] == pytest.approx(
+            slow.stats["guess_cost"], rel=1e-9
+        )
         assert fast.stats["cost"] == pytest.approx(slow.stats["cost"], rel=1e-4)
         assert close(u, expected, 0.01)
     mpc(2, compile=True, **options)  # from the cache
@@ -312,9 +393,15 @@ def test_loops_of_the_generated_code_are_reordered(checkpoint, tmp_path, monkeyp
     V.generate("V.c")
     before = Path("V.c").read_text()
     after = compiled.vectorised(before)
-    changed = [(a.split(), b.split()) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
-    assert len(changed) == 4 and changed[2][0] == changed[3][1] and changed[3][0] == changed[2][1]  # two lines change places
-    assert all(b.count("restrict") > 0 and [word for word in b if word != "restrict"] == a for a, b in changed[:2])
+    changed = [
+        (a.split(), b.split()) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b
+    ]
+    assert (
+        len(changed) == 4 and changed[2][0] == changed[3][1] and changed[3][0] == changed[2][1]
+    )  # two lines change places
+    assert all(
+        b.count("restrict") > 0 and [word for word in b if word != "restrict"] == a for a, b in changed[:2]
+    )
     assert compiled.vectorised("int nothing;") == "int nothing;"
 
 
@@ -330,7 +417,11 @@ def random_goal(plant, rng, horizon=None):
 def planner(case, pendulum_checkpoint=None):
     """A compiled controller, the arguments of `written_out`, and its critic."""
     name = {"pendulum": "double_pendulum"}.get(case.split()[0], case.split()[0])
-    paths = {"cstr": SHIPPED / "cstr_constrained.pt", "linear": SHIPPED / "linear_robust.pt", "double_pendulum": pendulum_checkpoint}
+    paths = {
+        "cstr": SHIPPED / "cstr_constrained.pt",
+        "linear": SHIPPED / "linear_robust.pt",
+        "double_pendulum": pendulum_checkpoint,
+    }
     critic = deploy.load_critic(paths[name], name)
     mu, _, V = deploy.export(critic)
     psi = critic.plant.SCENARIOS["mpc"]
@@ -344,24 +435,44 @@ def planner(case, pendulum_checkpoint=None):
         "pendulum N=2": (2, psi, 1, 1.0, np.array([0.1]), True),
         "linear N=2": (2, psi, 1, 1.0, 0.0, True),
     }[case]
-    stage, options = casadi_stage(critic.plant), dict(robust_horizon=robust_horizon, slack_price=price, change_weight=change)
+    stage, options = (
+        casadi_stage(critic.plant),
+        dict(robust_horizon=robust_horizon, slack_price=price, change_weight=change),
+    )
     if learned:
         options |= dict(value=V, policy=mu, expansion=expansion(critic))
     controller = deploy.ScenarioMPC(critic.plant, horizon, psi, stage, goal=critic.plant.EVAL_GOAL, **options)
-    written = dict(plant=critic.plant, psi=psi, stage=numpy_stage(critic.plant), value=torch_critic(critic) if learned else None,
-                   robust_horizon=robust_horizon, price=np.minimum(price, deploy.HARD_PRICE), change=change)  # fmt: skip
+    written = dict(
+        plant=critic.plant,
+        psi=psi,
+        stage=numpy_stage(critic.plant),
+        value=torch_critic(critic) if learned else None,
+        robust_horizon=robust_horizon,
+        price=np.minimum(price, deploy.HARD_PRICE),
+        change=change,
+    )
     return controller, written, mu if learned else None
 
 
-CASES = ["cstr N=5", "cstr branches twice", "cstr no bounds", "cstr one scenario N=1", "cstr one scenario N=10", "cstr nominal N=20",
-         "pendulum N=2", "linear N=2"]  # fmt: skip
+CASES = [
+    "cstr N=5",
+    "cstr branches twice",
+    "cstr no bounds",
+    "cstr one scenario N=1",
+    "cstr one scenario N=10",
+    "cstr nominal N=20",
+    "pendulum N=2",
+    "linear N=2",
+]
 
 
 def judged(controller, written, x, goal, u_before):
     """The plan of the last step by the definition of the problem."""
     goals = np.broadcast_to(goal.reshape(len(goal), -1), (len(goal), controller.horizon))
     starts = [x] * len(written["psi"])
-    return written_out(actions=controller.prediction()["u"], starts=starts, goal=goals, u_before=u_before, **written)
+    return written_out(
+        actions=controller.prediction()["u"], starts=starts, goal=goals, u_before=u_before, **written
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -376,7 +487,9 @@ def test_a_plan_is_a_rollout_within_the_limits_and_never_dearer_than_its_guess(c
         u_before = rng.uniform(plant.U_LOW, plant.U_HIGH)
         x_before = None if not trial else x if trial % 3 == 0 else envs.sample_states(plant, rng, 1)[0]
         if trial:  # the measurement is taken to the turn nearest to the last
-            x = x + np.isin(np.arange(len(x)), plant.ANGLES) * 2 * np.pi * np.round((x_before - x) / (2 * np.pi))
+            x = x + np.isin(np.arange(len(x)), plant.ANGLES) * 2 * np.pi * np.round(
+                (x_before - x) / (2 * np.pi)
+            )
         controller.set_goal(goal)
         stored = rng.uniform(-1, 1, size=(controller.tree.inner, len(u_scale))) if trial else None
         if trial > 4:  # a good one, which beats the policy's rollout
@@ -413,11 +526,15 @@ def test_a_plan_is_a_rollout_within_the_limits_and_never_dearer_than_its_guess(c
                     later = [part.T for part in physical[1:] + physical[-1:]]
                     later[0] = later[0][:, :1]  # under the first scenario
                     if written["robust_horizon"] < 2:
-                        assert guess_cost <= shifted_cost(controller, written, x, goal, u_before, later) + 1e-9
+                        assert (
+                            guess_cost <= shifted_cost(controller, written, x, goal, u_before, later) + 1e-9
+                        )
         assert len({(s["guess"], s["guess_cost"]) for s in found.values()}) == 1
         controller.reset()
         controller.u_before, controller.iterations, controller.deadline_ms = u_before.copy(), 0, None
-        controller.make_step(x)  # what it starts from without a stored plan: the policy's rollout or the middle
+        controller.make_step(
+            x
+        )  # what it starts from without a stored plan: the policy's rollout or the middle
         assert controller.stats["guess"] == ("middle" if mu is None else "policy")
         assert mu is None or guess_cost <= controller.stats["cost"] + 1e-9
         assert name != "policy" or guess_cost == pytest.approx(controller.stats["cost"], rel=1e-12)
@@ -432,7 +549,9 @@ def test_a_plan_is_a_rollout_within_the_limits_and_never_dearer_than_its_guess(c
 
 def shifted_cost(controller, written, x, goal, u_before, actions):
     goals = np.broadcast_to(goal.reshape(len(goal), -1), (len(goal), controller.horizon))
-    return written_out(actions=actions, starts=[x] * len(written["psi"]), goal=goals, u_before=u_before, **written)[1]
+    return written_out(
+        actions=actions, starts=[x] * len(written["psi"]), goal=goals, u_before=u_before, **written
+    )[1]
 
 
 def test_a_planner_with_a_policy_costs_no_more_than_the_policys_rollout():
@@ -451,7 +570,10 @@ def test_a_planner_with_a_policy_costs_no_more_than_the_policys_rollout():
     for t in range(5):
         u = [act(X0)] if t == 0 else [act(state) for state in x]
         actions.append(np.stack(u, axis=1))
-        x = [cstr.step(state, u[i if t else 0], psi, substeps=4) for i, (state, psi) in enumerate(zip(x, written["psi"]))]
+        x = [
+            cstr.step(state, u[i if t else 0], psi, substeps=4)
+            for i, (state, psi) in enumerate(zip(x, written["psi"]))
+        ]
     for mine, theirs in zip(controller.prediction()["u"], actions, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-7, atol=1e-6)
 
@@ -468,7 +590,10 @@ def test_every_finite_measurement_gives_an_action(case, pendulum_checkpoint):
         if kept:
             controller.make_step(plant.START)
         for size in (1e3, 1e12, 1e300, -1e12, -1e300, 1.7e308):
-            for x in (np.full(len(plant.X_LOW), size), np.where(rng.random(len(plant.X_LOW)) < 0.3, size, plant.START)):
+            for x in (
+                np.full(len(plant.X_LOW), size),
+                np.where(rng.random(len(plant.X_LOW)) < 0.3, size, plant.START),
+            ):
                 u = controller.make_step(x)
                 assert np.isfinite(u).all() and ((plant.U_LOW <= u) & (u <= plant.U_HIGH)).all()
                 assert controller.stats["rung"] in ("plan", "actor", "hold")
@@ -507,7 +632,9 @@ def test_a_plan_that_is_no_number_never_wins(case, pendulum_checkpoint):
 def test_what_the_caller_does_with_his_buffers_afterwards_changes_nothing(kind):
     psi, spoil = np.array([1.05, 0.9]), []
     mu = ca.Function("mu", [ca.MX.sym("x", 4), ca.MX.sym("g", 1)], [ca.DM([20.0, -2000.0])])
-    buffers = dict(scenarios=cstr.SCENARIOS["mpc"].copy(), goal=np.array([0.65]), slack_price=np.full((2, 4), 2.0))
+    buffers = dict(
+        scenarios=cstr.SCENARIOS["mpc"].copy(), goal=np.array([0.65]), slack_price=np.full((2, 4), 2.0)
+    )
     buffers |= dict(change_weight=np.zeros(2))
     careless = mpc(2, **buffers, policy=mu, estimator=envs.Estimator(cstr, kind))
     careful = mpc(2, goal=np.array([0.65]), slack_price=2.0, policy=mu, estimator=envs.Estimator(cstr, kind))
@@ -556,7 +683,9 @@ def test_full_turns_of_an_angle_change_no_action(pendulum_checkpoint):
 def test_a_wrong_angle_is_forgotten(glitches):
     """The next sound measurements are acted on as if it had not been there."""
     x, g = ca.MX.sym("x", 6), ca.MX.sym("g", 2)
-    controller = ActorController(double_pendulum, ca.Function("mu", [x, g], [5 * ca.sin(x[1])]), double_pendulum.EVAL_GOAL)
+    controller = ActorController(
+        double_pendulum, ca.Function("mu", [x, g], [5 * ca.sin(x[1])]), double_pendulum.EVAL_GOAL
+    )
     state = double_pendulum.START.copy()
     for angle in (0.1, *glitches, 0.1, 0.5, -0.5):
         state[1] = angle
@@ -582,7 +711,12 @@ def test_a_wrong_angle_is_forgotten(glitches):
 )
 def test_the_planner_refuses_what_is_no_setting(wrong, words):
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
-    given = dict(horizon=2, scenarios=cstr.SCENARIOS["mpc"], stage_cost=ca.Function("stage", [x, g], [x[1]]), goal=cstr.EVAL_GOAL)
+    given = dict(
+        horizon=2,
+        scenarios=cstr.SCENARIOS["mpc"],
+        stage_cost=ca.Function("stage", [x, g], [x[1]]),
+        goal=cstr.EVAL_GOAL,
+    )
     with pytest.raises(ValueError, match=words) as error:
         deploy.ScenarioMPC(cstr, compile=False, **given | wrong)
     assert "\n" not in str(error.value)
@@ -592,7 +726,12 @@ def test_a_goal_per_stage():
     """A constant one equals a single goal; a change that lies ahead is planned for."""
     actions = {}
     step = np.append(np.full((1, 4), 0.65), np.full((1, 4), 0.8), axis=1)
-    for name, goal in (("number", 0.65), ("vector", [0.65]), ("constant", np.full((1, 8), 0.65)), ("ahead", step)):
+    for name, goal in (
+        ("number", 0.65),
+        ("vector", [0.65]),
+        ("constant", np.full((1, 8), 0.65)),
+        ("ahead", step),
+    ):
         controller = mpc(8, robust_horizon=0, goal=goal)
         controller.stats, actions[name] = {}, solve(controller)[1]
         later = mpc(8, robust_horizon=0, goal=0.5)
@@ -603,13 +742,28 @@ def test_a_goal_per_stage():
     assert not close(actions["ahead"], actions["number"], 0.005)
 
 
-@pytest.mark.parametrize("goal", [[0.65, 0.65], np.full((1, 3), 0.65), np.full((2, 1), 0.65), np.nan, 0.05, 2.5, [[0.6, 0.6, 0.6, 9.0]], [],
-                                  "goal", None])  # fmt: skip
+@pytest.mark.parametrize(
+    "goal",
+    [
+        [0.65, 0.65],
+        np.full((1, 3), 0.65),
+        np.full((2, 1), 0.65),
+        np.nan,
+        0.05,
+        2.5,
+        [[0.6, 0.6, 0.6, 9.0]],
+        [],
+        "goal",
+        None,
+    ],
+)
 def test_a_goal_that_is_none_is_refused_and_leaves_the_last_one(goal):
     controller = mpc(4, scenarios=cstr.PSI_NOMINAL[None])
     with pytest.raises((ValueError, TypeError)):
         controller.set_goal(goal)
-    np.testing.assert_array_equal(controller.make_step(X0), mpc(4, scenarios=cstr.PSI_NOMINAL[None]).make_step(X0))
+    np.testing.assert_array_equal(
+        controller.make_step(X0), mpc(4, scenarios=cstr.PSI_NOMINAL[None]).make_step(X0)
+    )
 
 
 class Believing(Shifted):
@@ -619,7 +773,11 @@ class Believing(Shifted):
 
     def belief(self, x):
         starts, psi, weight = super().belief(x)
-        return starts if self.starts is None else self.starts, psi, weight if self.given is None else self.given
+        return (
+            starts if self.starts is None else self.starts,
+            psi,
+            weight if self.given is None else self.given,
+        )
 
 
 def test_weight_one_on_a_scenario_gives_that_scenarios_controller():
@@ -631,7 +789,9 @@ def test_weight_one_on_a_scenario_gives_that_scenarios_controller():
         for each in (controller, nominal):
             each.iterations = 0
             each.make_step(X0)
-        assert controller.stats["cost"] == pytest.approx(nominal.stats["cost"], rel=1e-10)  # of the same guess, the middle
+        assert controller.stats["cost"] == pytest.approx(
+            nominal.stats["cost"], rel=1e-10
+        )  # of the same guess, the middle
         controller.reset()
         nominal.reset()
         cost, u = solve(controller)
@@ -643,21 +803,38 @@ def test_weight_one_on_a_scenario_gives_that_scenarios_controller():
 @pytest.mark.parametrize("robust_horizon", [1, 2])
 def test_weighted_costs_add_up_and_scenarios_start_from_their_own_states(robust_horizon):
     rng, psi = np.random.default_rng(2), cstr.SCENARIOS["mpc"][[0, 4, 8]]
-    controller = mpc(3, psi, kind=Believing, robust_horizon=robust_horizon, change_weight=[1e-4, 1e-8], iterations=0)
+    controller = mpc(
+        3, psi, kind=Believing, robust_horizon=robust_horizon, change_weight=[1e-4, 1e-8], iterations=0
+    )
     controller.starts = X0 + rng.uniform(-1, 1, size=(3, 4)) * [0.1, 0.1, 5, 5]
     plan, u_before = rng.uniform(-1, 1, size=(controller.tree.inner, 2)), np.array([30.0, -4000.0])
 
     def cost(weight):
         controller.reset()
-        controller.given, controller.plan, controller.x_before, controller.u_before = weight, plan.copy(), cstr.START, u_before
+        controller.given, controller.plan, controller.x_before, controller.u_before = (
+            weight,
+            plan.copy(),
+            cstr.START,
+            u_before,
+        )
         controller.make_step(X0)
         return controller.stats["cost"]
 
     weight = np.array([0.5, 0.2, 0.3])
     mixed = cost(weight)
-    states, expected = written_out(cstr, controller.prediction()["u"], controller.starts, psi, np.full((1, 3), GOAL), numpy_stage(cstr),
-                                   robust_horizon=robust_horizon, weight=weight, price=1.0, change=np.array([1e-4, 1e-8]),
-                                   u_before=u_before)  # fmt: skip
+    states, expected = written_out(
+        cstr,
+        controller.prediction()["u"],
+        controller.starts,
+        psi,
+        np.full((1, 3), GOAL),
+        numpy_stage(cstr),
+        robust_horizon=robust_horizon,
+        weight=weight,
+        price=1.0,
+        change=np.array([1e-4, 1e-8]),
+        u_before=u_before,
+    )
     assert mixed == pytest.approx(expected, rel=1e-9)
     for mine, theirs in zip(controller.prediction()["x"], states):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9)
@@ -671,9 +848,19 @@ def test_a_disturbance_shifts_the_prediction_by_itself_at_the_first_stage():
     shifted.estimator.difference = d
     for controller in (plain, shifted):
         controller.make_step(X0)
-    np.testing.assert_allclose(shifted.prediction()["x"][0] - plain.prediction()["x"][0], np.tile(d[:, None], 9), atol=1e-10)
-    states, cost = written_out(cstr, shifted.prediction()["u"], [X0] * 9, cstr.SCENARIOS["mpc"], np.full((1, 3), GOAL), numpy_stage(cstr),
-                               price=1.0, disturbance=d)  # fmt: skip
+    np.testing.assert_allclose(
+        shifted.prediction()["x"][0] - plain.prediction()["x"][0], np.tile(d[:, None], 9), atol=1e-10
+    )
+    states, cost = written_out(
+        cstr,
+        shifted.prediction()["u"],
+        [X0] * 9,
+        cstr.SCENARIOS["mpc"],
+        np.full((1, 3), GOAL),
+        numpy_stage(cstr),
+        price=1.0,
+        disturbance=d,
+    )
     for mine, theirs in zip(shifted.prediction()["x"], states):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9)
     assert shifted.stats["cost"] == pytest.approx(cost, rel=1e-9)
@@ -683,8 +870,15 @@ def test_what_one_turn_adds_is_no_disturbance():
     psi, found = np.array([1.05, 0.95, 1.0]), []
     for turns in (0, 1):
         estimator = envs.Estimator(double_pendulum, "disturbance")
-        controller = deploy.ScenarioMPC(double_pendulum, 1, double_pendulum.SCENARIOS["nominal"], casadi_stage(double_pendulum),
-                                        goal=double_pendulum.EVAL_GOAL, estimator=estimator, compile=False)  # fmt: skip
+        controller = deploy.ScenarioMPC(
+            double_pendulum,
+            1,
+            double_pendulum.SCENARIOS["nominal"],
+            casadi_stage(double_pendulum),
+            goal=double_pendulum.EVAL_GOAL,
+            estimator=estimator,
+            compile=False,
+        )
         after = double_pendulum.step(double_pendulum.START, controller.make_step(double_pendulum.START), psi)
         after[double_pendulum.ANGLES] += 2 * np.pi * turns
         controller.make_step(after)
@@ -703,7 +897,10 @@ def made(kind, checkpoint):
     return ActorController(cstr, mu, GOAL) if kind == "actor" else GreedyController(cstr, mu, Q, GOAL)
 
 
-@pytest.mark.parametrize("state", [[0.8, 0.5, np.nan, 130], [0.8, 0.5, 134], [[0.8, 0.5, 134, 130]], [0.8, np.inf, 134, 130], [], 1.0])
+@pytest.mark.parametrize(
+    "state",
+    [[0.8, 0.5, np.nan, 130], [0.8, 0.5, 134], [[0.8, 0.5, 134, 130]], [0.8, np.inf, 134, 130], [], 1.0],
+)
 @pytest.mark.parametrize("kind", ["mpc", "actor", "greedy"])
 def test_a_state_that_is_none_is_refused_and_leaves_the_controller_as_it_was(state, kind, checkpoint):
     asked, control = (made(kind, checkpoint) for _ in range(2))
@@ -757,7 +954,9 @@ def test_failure_ladder(compile):
 
 def test_a_network_that_overflows_holds_the_last_action():
     x, goal = ca.MX.sym("x", 4), ca.MX.sym("goal", 1)
-    actor = ActorController(cstr, ca.Function("mu", [x, goal], [ca.vertcat(20.0, -2000.0) * ca.sqrt(1e3 - x[0])]), GOAL)
+    actor = ActorController(
+        cstr, ca.Function("mu", [x, goal], [ca.vertcat(20.0, -2000.0) * ca.sqrt(1e3 - x[0])]), GOAL
+    )
     first = actor.make_step(X0)
     np.testing.assert_array_equal(actor.make_step([1e6, 0.5, 134.0, 130.0]), first)
     assert actor.stats["rung"] == "hold" and actor.stats["fell_back"]
@@ -769,7 +968,11 @@ def test_a_late_controller_goes_on_where_it_stopped():
     """Stopped at once in every step, on a state that does not move, it keeps its plan; given time it improves it."""
     controller = mpc(3, deadline_ms=1e-6)
     controller.make_step(X0)
-    assert controller.stats["late"] and controller.stats["stop"] == "late" and controller.stats["guess"] == "middle"
+    assert (
+        controller.stats["late"]
+        and controller.stats["stop"] == "late"
+        and controller.stats["guess"] == "middle"
+    )
     late = controller.stats["cost"]
     controller.deadline_ms = 1e6
     controller.make_step(X0)
@@ -842,9 +1045,17 @@ def test_metrics_are_those_of_a_naive_loop(checkpoint):
         np.testing.assert_allclose(x[t + 1], cstr.step(x[t], u[t], psi))
         np.testing.assert_allclose(u[t], np.clip(np.array(mu(x[t], GOAL)).ravel(), cstr.U_LOW, cstr.U_HIGH))
         near += np.exp(-((0.65 - x[t + 1][1]) ** 2) / 0.02)
-        outside += np.exp(-sum(max(v - h, low - v, 0) ** 2 for v, low, h in zip(x[t + 1], cstr.X_LOW, cstr.X_HIGH)) / 0.02) - 1
+        outside += (
+            np.exp(
+                -sum(max(v - h, low - v, 0) ** 2 for v, low, h in zip(x[t + 1], cstr.X_LOW, cstr.X_HIGH))
+                / 0.02
+            )
+            - 1
+        )
     assert cstr.METRIC_SIGMA2 == 0.01
-    assert row["time_near_goal"] == pytest.approx(near) and row["time_outside_constraints"] == pytest.approx(outside)
+    assert row["time_near_goal"] == pytest.approx(near) and row["time_outside_constraints"] == pytest.approx(
+        outside
+    )
     assert row["ape_tail"] == pytest.approx(np.mean(100 * np.abs(x[-25:, 1] - 0.65) / 0.65))
     assert row["iterations"] == row["late"] == row["fell_back"] == 0
     assert 0 < row["solve_ms_median"] <= row["solve_ms_p95"]
@@ -861,14 +1072,18 @@ def test_counts_are_those_of_the_steps(checkpoint):
             controller.deadline_ms = 1e-6 if len(found) == 1 else None
             u = controller.make_step([1e200, 0.5, 134.0, 130.0] if len(found) == 3 else x)
             self.stats = controller.stats
-            found.append((self.stats["iterations"], self.stats["late"], self.stats["fell_back"], self.stats["wall_ms"]))
+            found.append(
+                (self.stats["iterations"], self.stats["late"], self.stats["fell_back"], self.stats["wall_ms"])
+            )
             return u
 
     row = run_episode(Recording(), cstr, X0, cstr.PSI_NOMINAL, GOAL, 6)[2]
     iterations, late, fell_back, wall = np.array(found, dtype=float).T
     assert row["iterations"] == pytest.approx(iterations.mean()) and iterations.mean() > 0
     assert (row["late"], row["fell_back"]) == (late.sum(), fell_back.sum()) == (1, 1)
-    assert row["solve_ms_median"] == pytest.approx(np.median(wall)) and row["solve_ms_p95"] == pytest.approx(np.quantile(wall, 0.95))
+    assert row["solve_ms_median"] == pytest.approx(np.median(wall)) and row["solve_ms_p95"] == pytest.approx(
+        np.quantile(wall, 0.95)
+    )
 
 
 def test_draws_are_paired_and_do_not_depend_on_their_number():
@@ -877,13 +1092,27 @@ def test_draws_are_paired_and_do_not_depend_on_their_number():
     np.testing.assert_array_equal(few[1], many[1][:3])
     assert (few[0] != draws(cstr, 3, seed=2)[0]).all()
     assert ((cstr.INIT_LOW <= many[0]) & (many[0] <= cstr.INIT_HIGH)).all()
-    assert all((psi == cstr.EVAL_PSI).all(axis=1).any() for psi in many[1]) and len(np.unique(many[1], axis=0)) > 5
+    assert (
+        all((psi == cstr.EVAL_PSI).all(axis=1).any() for psi in many[1])
+        and len(np.unique(many[1], axis=0)) > 5
+    )
 
 
-@pytest.mark.parametrize("name, options", [("actor", {}), ("rl_mpc", dict(horizon=0)), ("rl_mpc", dict(horizon=2)), ("nominal_mpc", {}),
-                                           ("goal_mpc", dict(horizon=2, constraints="hard"))])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("actor", {}),
+        ("rl_mpc", dict(horizon=0)),
+        ("rl_mpc", dict(horizon=2)),
+        ("nominal_mpc", {}),
+        ("goal_mpc", dict(horizon=2, constraints="hard")),
+    ],
+)
 def test_a_new_goal_gives_what_a_new_controller_gives(name, options, checkpoint):
-    both = [deploy.build_controller(name, deploy.Args(critic=checkpoint, compile=False, goal=goal, **options)) for goal in ((0.5,), (0.8,))]
+    both = [
+        deploy.build_controller(name, deploy.Args(critic=checkpoint, compile=False, goal=goal, **options))
+        for goal in ((0.5,), (0.8,))
+    ]
     both[0].make_step(X0)
     before = both[0].make_step(X0)
     both[0].set_goal((0.8,))
@@ -925,12 +1154,22 @@ def test_the_compared_planners_solve_what_the_documentation_says(name):
         written = dict(stage=lambda x, g: (x[1] - g[0]) ** 2, change=change, robust_horizon=int(robust))
         horizon = 20
     else:
-        written = dict(stage=lambda x, g: -np.exp(-((x[1] - g[0]) ** 2) / (2 * 0.2**2)), change=np.array([1e-4, 1e-8]))
+        written = dict(
+            stage=lambda x, g: -np.exp(-((x[1] - g[0]) ** 2) / (2 * 0.2**2)), change=np.array([1e-4, 1e-8])
+        )
         horizon, price = 3, 3.0
         if name == "rl_mpc":
             written["value"] = torch_critic(deploy.load_critic(deploy.critic_path(args), "cstr"))
-    _, cost = written_out(cstr, controller.prediction()["u"], [[0.8, 0.5, 143.0, 130.0]] * 9, psi, np.full((1, horizon), 0.7), price=price,
-                          u_before=np.zeros(2), **written)  # fmt: skip
+    _, cost = written_out(
+        cstr,
+        controller.prediction()["u"],
+        [[0.8, 0.5, 143.0, 130.0]] * 9,
+        psi,
+        np.full((1, horizon), 0.7),
+        price=price,
+        u_before=np.zeros(2),
+        **written,
+    )
     assert controller.horizon == horizon and controller.stats["cost"] == pytest.approx(cost, rel=1e-9)
 
 
@@ -939,12 +1178,23 @@ def test_the_slack_weight_follows_the_critic(checkpoint, tmp_path):
     data = torch.load(checkpoint, weights_only=True)
     torch.save(data | {"args": data["args"] | {"constraint_weight": 3.0}}, tmp_path / "aware.pt")
     hot = np.array([0.8, 0.6, 160.0, 155.0])
-    for path, given, wanted in ((checkpoint, None, 1.0), (tmp_path / "aware.pt", None, 2.0), (tmp_path / "aware.pt", 5.0, 5.0)):
+    for path, given, wanted in (
+        (checkpoint, None, 1.0),
+        (tmp_path / "aware.pt", None, 2.0),
+        (tmp_path / "aware.pt", 5.0, 5.0),
+    ):
         args = deploy.Args(critic=path, horizon=1, slack_weight=given, compile=False, iterations=0)
         controller = deploy.build_controller("goal_mpc", args)
         controller.make_step(hot)
-        cost = written_out(cstr, controller.prediction()["u"], [hot] * 9, cstr.SCENARIOS["mpc"], np.full((1, 1), GOAL), numpy_stage(cstr),
-                           price=wanted)[1]  # fmt: skip
+        cost = written_out(
+            cstr,
+            controller.prediction()["u"],
+            [hot] * 9,
+            cstr.SCENARIOS["mpc"],
+            np.full((1, 1), GOAL),
+            numpy_stage(cstr),
+            price=wanted,
+        )[1]
         assert controller.stats["cost"] == pytest.approx(cost, rel=1e-9) and cost > 10 * wanted
     assert deploy.critic_path(deploy.Args()).name == "cstr_constrained.pt"
     assert deploy.critic_path(deploy.Args(env="linear")).name == "linear_robust.pt"
@@ -953,18 +1203,40 @@ def test_the_slack_weight_follows_the_critic(checkpoint, tmp_path):
 # Command line
 
 
-COLUMNS = ("env controller horizon critic goal episode seed psi arguments time_near_goal time_outside_constraints ape_tail solve_ms_median "
-           "solve_ms_p95 iterations late fell_back").split()  # fmt: skip
+COLUMNS = (
+    "env controller horizon critic goal episode seed psi arguments time_near_goal time_outside_constraints ape_tail solve_ms_median "
+    "solve_ms_p95 iterations late fell_back"
+).split()
 
 
 def test_command_line_end_to_end_and_any_number_of_jobs(checkpoint, tmp_path):
     tables = []
     for jobs in (1, 2):
-        out = run_script("--critic", checkpoint, "--episodes", 3, "--steps", 3, "--horizon", 1, "--jobs", jobs,
-                         "--controllers", "actor", "nominal_mpc", "rl_mpc", "--out", tmp_path / str(jobs))  # fmt: skip
+        out = run_script(
+            "--critic",
+            checkpoint,
+            "--episodes",
+            3,
+            "--steps",
+            3,
+            "--horizon",
+            1,
+            "--jobs",
+            jobs,
+            "--controllers",
+            "actor",
+            "nominal_mpc",
+            "rl_mpc",
+            "--out",
+            tmp_path / str(jobs),
+        )
         assert out.returncode == 0, out.stderr
         assert "RL+MPC, N = 1" in out.stdout and "nominal MPC, N = 20" in out.stdout
-        assert {p.name for p in (tmp_path / str(jobs)).iterdir()} == {"results.csv", "trajectories.npz", "episode.png"}
+        assert {p.name for p in (tmp_path / str(jobs)).iterdir()} == {
+            "results.csv",
+            "trajectories.npz",
+            "episode.png",
+        }
         rows = list(csv.DictReader(open(tmp_path / str(jobs) / "results.csv")))
         assert list(rows[0]) == COLUMNS and len(rows) == 9
         assert len(json.loads(rows[0]["psi"])) == 2 and json.loads(rows[0]["arguments"]) == {"steps": 3}
@@ -982,8 +1254,20 @@ def test_command_line_end_to_end_and_any_number_of_jobs(checkpoint, tmp_path):
 
 
 def test_horizon_zero_and_other_arguments_reach_the_table(checkpoint, tmp_path):
-    for given in (dict(horizon=0), dict(horizon=1, deadline_ms=0.001, change_weight=(1e-4, 1e-8), constraints="hard")):
-        args = deploy.Args(critic=checkpoint, episodes=1, steps=2, jobs=1, controllers=("rl_mpc",), compile=False, out=tmp_path, **given)
+    for given in (
+        dict(horizon=0),
+        dict(horizon=1, deadline_ms=0.001, change_weight=(1e-4, 1e-8), constraints="hard"),
+    ):
+        args = deploy.Args(
+            critic=checkpoint,
+            episodes=1,
+            steps=2,
+            jobs=1,
+            controllers=("rl_mpc",),
+            compile=False,
+            out=tmp_path,
+            **given,
+        )
         (returned,) = deploy.main(args)
         (row,) = csv.DictReader(open(tmp_path / "results.csv"))
         assert row == {k: str(v) for k, v in returned.items()}
@@ -1017,7 +1301,12 @@ def test_horizon_zero_and_other_arguments_reach_the_table(checkpoint, tmp_path):
 )
 def test_bad_arguments_are_refused_in_one_sentence(arguments, words, checkpoint, tmp_path):
     """Before anything is written or computed; through main, as the command line goes."""
-    line = [*([] if "--critic" in arguments else ["--critic", str(checkpoint)]), "--controllers", "rl_mpc", *arguments]
+    line = [
+        *([] if "--critic" in arguments else ["--critic", str(checkpoint)]),
+        "--controllers",
+        "rl_mpc",
+        *arguments,
+    ]
     line += [] if "--out" in arguments else ["--out", str(tmp_path / "out")]
     with pytest.raises(ValueError) as error:
         deploy.main(tyro.cli(deploy.Args, args=line))
@@ -1026,7 +1315,8 @@ def test_bad_arguments_are_refused_in_one_sentence(arguments, words, checkpoint,
 
 
 @pytest.mark.parametrize(
-    "arguments, words", [(["--horizon", "-1"], ["error: --horizon is -1"]), (["--controllers", "pid"], ["pid", "rl_mpc"])]
+    "arguments, words",
+    [(["--horizon", "-1"], ["error: --horizon is -1"]), (["--controllers", "pid"], ["pid", "rl_mpc"])],
 )
 def test_bad_arguments_exit_with_code_2(arguments, words, checkpoint):
     out = run_script("--critic", checkpoint, *arguments)

@@ -22,9 +22,20 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "experiments"))
 import reproduce  # noqa: E402
 
-PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
-SCRIPTS = {"sac_her_branching.py": sac_her_branching, "goal_mpc.py": goal_mpc, "rl_mpc_deploy.py": rl_mpc_deploy}
-SOURCES = [path for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments") for path in sorted((ROOT / folder).glob("*.py"))]
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text()
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+}
+SCRIPTS = {
+    "sac_her_branching.py": sac_her_branching,
+    "goal_mpc.py": goal_mpc,
+    "rl_mpc_deploy.py": rl_mpc_deploy,
+}
+SOURCES = [
+    path
+    for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments")
+    for path in sorted((ROOT / folder).glob("*.py"))
+]
 
 
 def commands():
@@ -38,10 +49,16 @@ def commands():
     return [(script, shlex.split(words)) for script, words in found]
 
 
-COMMANDS = [command for command in commands() if command[0] in SCRIPTS and "quadruple_tank" not in command[1] and command[1] != ["--help"]]
+COMMANDS = [
+    command
+    for command in commands()
+    if command[0] in SCRIPTS and "quadruple_tank" not in command[1] and command[1] != ["--help"]
+]
 
 
-@pytest.mark.parametrize("script, words", COMMANDS, ids=lambda value: " ".join(value) if isinstance(value, list) else value)
+@pytest.mark.parametrize(
+    "script, words", COMMANDS, ids=lambda value: " ".join(value) if isinstance(value, list) else value
+)
 def test_every_command_of_the_three_scripts_runs(script, words, checkpoint, tmp_path):
     """End to end, with its own arguments, but for a few steps instead of many."""
     module = SCRIPTS[script]
@@ -58,7 +75,9 @@ def test_every_command_of_the_three_scripts_runs(script, words, checkpoint, tmp_
     if module is sac_her_branching:
         few = dict(total_timesteps=640, learning_starts=320, num_envs=32, eval_episodes=4, buffer_size=3200)
     elif module is rl_mpc_deploy:
-        few = dict(episodes=1, steps=2, jobs=1, compile=False)  # compiled, they run in test_the_worked_example
+        few = dict(
+            episodes=1, steps=2, jobs=1, compile=False
+        )  # compiled, they run in test_the_worked_example
     else:
         few = dict(steps=min(args.steps, 6), animate=False, compile=False)
     module.main(replace(args, **few, out=tmp_path))
@@ -74,7 +93,11 @@ def interrupted(folder):
     return run
 
 
-@pytest.mark.parametrize("command", [command for command in commands() if command[0] not in SCRIPTS], ids=lambda c: " ".join([c[0], *c[1]]))
+@pytest.mark.parametrize(
+    "command",
+    [command for command in commands() if command[0] not in SCRIPTS],
+    ids=lambda c: " ".join([c[0], *c[1]]),
+)
 def test_every_command_of_an_experiment_is_a_step_of_the_reproduction(command):
     """Which runs all of them, on tiny budgets, in test_experiments.py; here their arguments are read."""
     script, words = command
@@ -88,7 +111,11 @@ def test_every_command_of_an_experiment_is_a_step_of_the_reproduction(command):
 
 
 def snippets():
-    return [(page, code) for page, text in PAGES.items() for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)]
+    return [
+        (page, code)
+        for page, text in PAGES.items()
+        for code in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    ]
 
 
 @pytest.mark.parametrize("page, code", snippets(), ids=lambda value: value[:30])
@@ -108,11 +135,19 @@ def test_the_worked_example_from_equations_to_deployed_controller(tmp_path):
     (tmp_path / "envs/quadruple_tank.py").write_text(module)
     lines = re.findall(r"python (\w+\.py)([^`#\n]*--env quadruple_tank[^`#\n]*)", page)
     assert [script for script, _ in lines] == ["goal_mpc.py", "sac_her_branching.py", "rl_mpc_deploy.py"]
-    short = {"goal_mpc.py": ["--steps", "5"], "rl_mpc_deploy.py": ["--steps", "5", "--episodes", "1"],
-             "sac_her_branching.py": ["--total-timesteps", "9600", "--eval-every", "0", "--eval-episodes", "20"]}  # fmt: skip
+    short = {
+        "goal_mpc.py": ["--steps", "5"],
+        "rl_mpc_deploy.py": ["--steps", "5", "--episodes", "1"],
+        "sac_her_branching.py": ["--total-timesteps", "9600", "--eval-every", "0", "--eval-episodes", "20"],
+    }
     for script, words in lines:
         trained = next(tmp_path.glob("runs/*sac*/checkpoint.pt"), Path("none"))
-        command = [sys.executable, script, *words.replace("runs/NAME/checkpoint.pt", str(trained)).split(), *short[script]]
+        command = [
+            sys.executable,
+            script,
+            *words.replace("runs/NAME/checkpoint.pt", str(trained)).split(),
+            *short[script],
+        ]
         out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert out.returncode == 0, out.stderr
     assert "RL+MPC" in out.stdout
@@ -132,28 +167,50 @@ def test_links_files_and_figures_exist():
 def test_anchors_exist():
     for page, text in PAGES.items():
         for target, anchor in re.findall(r"\]\(([^)#]*)#([^)]+)\)", text):
-            there = PAGES[((ROOT / page).parent / target).resolve().relative_to(ROOT).as_posix()] if target else text
+            there = (
+                PAGES[((ROOT / page).parent / target).resolve().relative_to(ROOT).as_posix()]
+                if target
+                else text
+            )
             headings = re.findall(r"^#+ (.*)$", there, flags=re.MULTILINE)
-            assert anchor in [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings], (page, anchor)
+            assert anchor in [
+                re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings
+            ], (page, anchor)
 
 
 def test_arguments_and_names_of_the_code_that_pages_mention_exist():
     for page, text in PAGES.items():
         own = SCRIPTS.get(Path(page).stem + ".py")
-        fields = {name for source in SOURCES for name in re.findall(r"^    (\w+): ", source.read_text(), flags=re.MULTILINE)} | {"help"}
+        fields = {
+            name
+            for source in SOURCES
+            for name in re.findall(r"^    (\w+): ", source.read_text(), flags=re.MULTILINE)
+        } | {"help"}
         for argument in re.findall(r"`--([a-z][\w-]*)", text):
             name = argument.removeprefix("no-").replace("-", "_")
             assert name in fields or argument.replace("-", "_") in fields, (page, argument)
         for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", text):
-            source = next(place / path for place in (ROOT, ROOT / "envs", ROOT / "experiments") if (place / path).exists())
-            defined = {node.name for node in ast.walk(ast.parse(source.read_text())) if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
-            assert set(name.split(".")) <= defined | set(re.findall(r"^(\w+)\b.*=", source.read_text(), flags=re.MULTILINE)), (
+            source = next(
+                place / path
+                for place in (ROOT, ROOT / "envs", ROOT / "experiments")
+                if (place / path).exists()
+            )
+            defined = {
+                node.name
+                for node in ast.walk(ast.parse(source.read_text()))
+                if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+            }
+            assert set(name.split(".")) <= defined | set(
+                re.findall(r"^(\w+)\b.*=", source.read_text(), flags=re.MULTILINE)
+            ), (
                 page,
                 path,
                 name,
             )
         if own:  # a page's table has every argument of its script
-            missing = [name for name in own.Args.__dataclass_fields__ if f"--{name.replace('_', '-')}" not in text]
+            missing = [
+                name for name in own.Args.__dataclass_fields__ if f"--{name.replace('_', '-')}" not in text
+            ]
             assert not missing, (page, missing)
 
 

@@ -28,7 +28,12 @@ def test_energy_is_conserved_without_force():
     def energy(x):
         return dp.kinetic_energy(x.T, psi.T) + dp.potential_energy(x.T, psi.T)
 
-    start, scale = energy(x), np.ptp(dp.potential_energy(np.array([[0, 0], [0, np.pi], [0, np.pi], [0, 0], [0, 0], [0, 0]]), psi[:2].T))
+    start, scale = (
+        energy(x),
+        np.ptp(
+            dp.potential_energy(np.array([[0, 0], [0, np.pi], [0, np.pi], [0, 0], [0, 0], [0, 0]]), psi[:2].T)
+        ),
+    )
     for _ in range(250):
         x = dp.step(x, force, psi, substeps=100)
     assert np.abs(energy(x) - start).max() / scale < 1e-8
@@ -39,7 +44,14 @@ def test_step_agrees_with_a_stiff_integrator():
     x, u, psi = random_points(200)
     exact = np.array(
         [
-            solve_ivp(lambda _, y, i=i: dp.ode(y, u[i], psi[i]), (0, dp.DT), x[i], method="Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+            solve_ivp(
+                lambda _, y, i=i: dp.ode(y, u[i], psi[i]),
+                (0, dp.DT),
+                x[i],
+                method="Radau",
+                rtol=1e-10,
+                atol=1e-12,
+            ).y[:, -1]
             for i in range(len(x))
         ]
     )
@@ -60,9 +72,18 @@ def test_accelerations_satisfy_the_implicit_euler_lagrange_equations():
     for (_, a, b, _, da, db), (force,) in zip(x, u):
         ddp, dda, ddb = dp.ode(np.array([0, a, b, 0, da, db]), np.array([force]), np.ones(3))[3:]
         residual = [
-            h1 * ddp + h2 * dda * np.cos(a) + h3 * ddb * np.cos(b) - (h2 * da**2 * np.sin(a) + h3 * db**2 * np.sin(b) + force),
-            h2 * np.cos(a) * ddp + h4 * dda + h5 * np.cos(a - b) * ddb - (h7 * np.sin(a) - h5 * db**2 * np.sin(a - b)),
-            h3 * np.cos(b) * ddp + h5 * np.cos(a - b) * dda + h6 * ddb - (h5 * da**2 * np.sin(a - b) + h8 * np.sin(b)),
+            h1 * ddp
+            + h2 * dda * np.cos(a)
+            + h3 * ddb * np.cos(b)
+            - (h2 * da**2 * np.sin(a) + h3 * db**2 * np.sin(b) + force),
+            h2 * np.cos(a) * ddp
+            + h4 * dda
+            + h5 * np.cos(a - b) * ddb
+            - (h7 * np.sin(a) - h5 * db**2 * np.sin(a - b)),
+            h3 * np.cos(b) * ddp
+            + h5 * np.cos(a - b) * dda
+            + h6 * ddb
+            - (h5 * da**2 * np.sin(a - b) + h8 * np.sin(b)),
         ]
         np.testing.assert_allclose(residual, 0, atol=1e-12)
 
@@ -70,7 +91,11 @@ def test_accelerations_satisfy_the_implicit_euler_lagrange_equations():
 def test_the_same_lines_serve_numpy_torch_and_casadi():
     x, u, psi = random_points(7)
     symbols = [ca.SX.sym(name, n) for name, n in (("x", 6), ("u", 1), ("psi", 3))]
-    for function in (dp.ode, lambda x, u, psi, xp: dp.kinetic_energy(x, psi, xp), lambda x, u, psi, xp: dp.potential_energy(x, psi, xp)):
+    for function in (
+        dp.ode,
+        lambda x, u, psi, xp: dp.kinetic_energy(x, psi, xp),
+        lambda x, u, psi, xp: dp.potential_energy(x, psi, xp),
+    ):
         expected = np.atleast_2d(function(x.T, u.T, psi.T, np))
         in_torch = np.atleast_2d(function(*(torch.tensor(a.T) for a in (x, u, psi)), torch).numpy())
         in_casadi = np.array(ca.Function("f", symbols, [function(*symbols, ca)]).map(7)(x.T, u.T, psi.T))
@@ -83,7 +108,9 @@ def test_equilibria_and_their_names():
         x = np.array([0.3, a, b, 0, 0, 0])
         np.testing.assert_allclose(dp.ode(x, np.zeros(1), dp.PSI_NOMINAL), 0, atol=1e-14)
         joint, tip = dp.skeleton(x)[1:, 1]
-        assert [name.split("-")[0], name.split("-")[1]] == ["up" if v > 0 else "down" for v in (joint, tip - joint)]
+        assert [name.split("-")[0], name.split("-")[1]] == [
+            "up" if v > 0 else "down" for v in (joint, tip - joint)
+        ]
 
 
 def test_scenario_sets():
@@ -118,11 +145,20 @@ def test_vector_env_follows_the_physics_and_errors_go_the_short_way_round():
 def test_training_and_deployment_run_on_it(tmp_path):
     """A few hundred transitions; the checkpoint's networks see angles as sine and cosine, in torch and in CasADi alike."""
     run = training.main(
-        training.Args(env="double_pendulum", total_timesteps=2_000, num_envs=8, batch_size=32, eval_episodes=10, out=tmp_path)
+        training.Args(
+            env="double_pendulum",
+            total_timesteps=2_000,
+            num_envs=8,
+            batch_size=32,
+            eval_episodes=10,
+            out=tmp_path,
+        )
     )
     policy = training.load_policy(run / "checkpoint.pt")
     x, turns = dp.START[None], np.array([[0, 2 * np.pi, -4 * np.pi, 0, 0, 0]])
-    np.testing.assert_allclose(policy.act(x + turns, dp.EVAL_GOAL), policy.act(x, dp.EVAL_GOAL), atol=1e-4)  # a full turn is none
+    np.testing.assert_allclose(
+        policy.act(x + turns, dp.EVAL_GOAL), policy.act(x, dp.EVAL_GOAL), atol=1e-4
+    )  # a full turn is none
     for goal_input in ("error", "goal"):
         data = torch.load(run / "checkpoint.pt", weights_only=True) | {"goal_input": goal_input}
         torch.save(data, tmp_path / "c.pt")
@@ -130,9 +166,21 @@ def test_training_and_deployment_run_on_it(tmp_path):
         mu, _, V = deploy.export(critic)
         assert deploy.check_export(critic, V) < 1e-12
         policy = training.load_policy(tmp_path / "c.pt")
-        np.testing.assert_allclose(np.array(mu(dp.START, [0.1, 3.0])).ravel(), policy.act(x, [0.1, 3.0])[0], atol=1e-3)
-    args = deploy.Args(env="double_pendulum", critic=run / "checkpoint.pt", horizon=2, episodes=1, steps=3, jobs=1, compile=False,
-                       controllers=("actor", "nominal_mpc", "rl_mpc"), goal=(0.0, 3.0), out=tmp_path / "deploy")  # fmt: skip
+        np.testing.assert_allclose(
+            np.array(mu(dp.START, [0.1, 3.0])).ravel(), policy.act(x, [0.1, 3.0])[0], atol=1e-3
+        )
+    args = deploy.Args(
+        env="double_pendulum",
+        critic=run / "checkpoint.pt",
+        horizon=2,
+        episodes=1,
+        steps=3,
+        jobs=1,
+        compile=False,
+        controllers=("actor", "nominal_mpc", "rl_mpc"),
+        goal=(0.0, 3.0),
+        out=tmp_path / "deploy",
+    )
     rows = deploy.main(args)
     assert [row["controller"] for row in rows] == ["actor", "nominal_mpc", "rl_mpc"]
     assert all(np.isfinite(row["time_near_goal"]) and row["time_outside_constraints"] == 0 for row in rows)

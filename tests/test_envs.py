@@ -35,7 +35,14 @@ def test_step_agrees_with_a_stiff_integrator(points):
     x, u, psi = points
     exact = np.array(
         [
-            solve_ivp(lambda _, y, i=i: cstr.ode(y, u[i], psi[i]), (0, cstr.DT), x[i], method="LSODA", rtol=1e-10, atol=1e-11).y[:, -1]
+            solve_ivp(
+                lambda _, y, i=i: cstr.ode(y, u[i], psi[i]),
+                (0, cstr.DT),
+                x[i],
+                method="LSODA",
+                rtol=1e-10,
+                atol=1e-11,
+            ).y[:, -1]
             for i in range(len(x))
         ]
     )
@@ -97,7 +104,15 @@ def test_stable_baselines3_her_runs():
     from stable_baselines3 import SAC, HerReplayBuffer
 
     env = gym.make("RLMPC/CSTR-v0")
-    model = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=100, train_freq=8, seed=0, device="cpu")
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        learning_starts=100,
+        train_freq=8,
+        seed=0,
+        device="cpu",
+    )
     model.learn(500)
     action, _ = model.predict(env.reset(seed=0)[0], deterministic=True)
     assert env.action_space.contains(action)
@@ -108,7 +123,11 @@ def test_reward_is_that_of_the_next_achieved_goal():
     obs, _ = env.reset(seed=1, options={"state": [0.8, 0.5, 130, 130], "goal": [0.6], "psi": [1.0, 1.0]})
     new, reward, terminated, truncated, info = env.step(np.array([20.0, -1000.0], dtype=np.float32))
     np.testing.assert_allclose(new["observation"], cstr.step(obs["observation"], [20.0, -1000.0], [1.0, 1.0]))
-    assert reward == np.exp(-((new["observation"][1] - 0.6) ** 2) / (2 * 1e-4)) == env.compute_reward(new["achieved_goal"], np.array([0.6]))
+    assert (
+        reward
+        == np.exp(-((new["observation"][1] - 0.6) ** 2) / (2 * 1e-4))
+        == env.compute_reward(new["achieved_goal"], np.array([0.6]))
+    )
     assert not terminated and not truncated
 
 
@@ -119,7 +138,9 @@ def test_sparse_reward():
 
 
 def test_vector_env_resets_in_the_same_step_and_branches():
-    vec = gym.make_vec("RLMPC/CSTR-v0", num_envs=5, scenarios="mpc", branches=16, max_episode_steps=3).unwrapped
+    vec = gym.make_vec(
+        "RLMPC/CSTR-v0", num_envs=5, scenarios="mpc", branches=16, max_episode_steps=3
+    ).unwrapped
     assert vec.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
     obs, _ = vec.reset(seed=0)
     for t in range(7):
@@ -132,7 +153,10 @@ def test_vector_env_resets_in_the_same_step_and_branches():
         np.testing.assert_allclose(reached, cstr.step(obs["observation"], u, infos["psi"]))
         np.testing.assert_array_equal(reward, vec.compute_reward(reached[:, [1]], obs["desired_goal"]))
         # every branch is the step under one of the nine scenarios, and they are not all the same one
-        candidates = np.stack([cstr.step(obs["observation"], u, np.broadcast_to(psi, (5, 2))) for psi in cstr.SCENARIOS["mpc"]], axis=1)
+        candidates = np.stack(
+            [cstr.step(obs["observation"], u, np.broadcast_to(psi, (5, 2))) for psi in cstr.SCENARIOS["mpc"]],
+            axis=1,
+        )
         distance = np.abs(infos["branch_states"][:, :, None] - candidates[:, None]).max(-1)
         assert distance.min(-1).max() < 1e-12
         assert len(np.unique(distance.argmin(-1))) > 1
@@ -193,7 +217,9 @@ def test_a_goal_of_another_shape_or_outside_the_range_is_refused(plant, goal, ho
 
 def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path):
     made = [new_folder(tmp_path / "runs/cstr__0__1") for _ in range(3)]
-    assert [path.name for path in made] == ["cstr__0__1", "cstr__0__1-2", "cstr__0__1-3"] and all(path.is_dir() for path in made)
+    assert [path.name for path in made] == ["cstr__0__1", "cstr__0__1-2", "cstr__0__1-3"] and all(
+        path.is_dir() for path in made
+    )
 
 
 def test_unknown_names_are_refused_with_the_list():

@@ -21,7 +21,12 @@ TABLES = sorted(path.name for path in (ROOT / "experiments/results").glob("*.csv
 FIGURES = sorted(path.name for path in (ROOT / "experiments/figures").iterdir())
 # measured with the planner before the present one: their columns may differ, and figures that need the new ones are not redrawn
 EARLIER = {"cstr_tune", "cstr_literal", "cstr_frontier", "cstr_ablation", "cstr_shift"}
-EARLIER |= {"cstr_training", "cstr_training_seeds", "training_speed_ablation", "training_speed_peer"}  # without time outside constraints
+EARLIER |= {
+    "cstr_training",
+    "cstr_training_seeds",
+    "training_speed_ablation",
+    "training_speed_peer",
+}  # without time outside constraints
 NOT_REDRAWN = {"cstr_deploy_literal"}
 TEXT = {
     "case",
@@ -74,10 +79,15 @@ def test_a_table_has_the_columns_of_the_committed_one_and_finite_numbers(table, 
     committed = list(csv.DictReader(open(ROOT / "experiments/results" / table)))
     assert rows and (Path(table).stem in EARLIER or list(rows[0]) == list(committed[0]))
     for row in rows + committed:
-        if table == "benchmark_peers.csv":  # it has no number where a peer is not installed or did not converge
+        if (
+            table == "benchmark_peers.csv"
+        ):  # it has no number where a peer is not installed or did not converge
             row = {key: value for key, value in row.items() if value}
         for key, value in row.items():  # the weight of a hard bound is infinite
-            assert key in TEXT or (key, value) == ("slack_weight", "inf") or np.isfinite(float(value)), (key, value)
+            assert key in TEXT or (key, value) == ("slack_weight", "inf") or np.isfinite(float(value)), (
+                key,
+                value,
+            )
         assert "psi" not in row or len(json.loads(row["psi"])) == 2
 
 
@@ -85,12 +95,21 @@ def test_what_is_finished_is_not_repeated(quick):
     """Neither by the reproduction nor by an experiment, whose parts are kept one by one."""
 
     def written():
-        kept = (path for path in (quick / "runs").rglob("*") if path.is_file() and path.suffix in (".csv", ".pt", ".json"))
+        kept = (
+            path
+            for path in (quick / "runs").rglob("*")
+            if path.is_file() and path.suffix in (".csv", ".pt", ".json")
+        )
         return {path: path.stat().st_mtime_ns for path in kept}
 
     before = written()
-    assert f"{len(reproduce.STEPS)} steps done" in run("reproduce", "--quick", "--out", quick, "--runs", quick / "runs")
-    for name, study, folder in (("cstr_deploy", "deploy", "cstr_loops"), ("linear_value_mpc", "train", "linear_value_mpc")):
+    assert f"{len(reproduce.STEPS)} steps done" in run(
+        "reproduce", "--quick", "--out", quick, "--runs", quick / "runs"
+    )
+    for name, study, folder in (
+        ("cstr_deploy", "deploy", "cstr_loops"),
+        ("linear_value_mpc", "train", "linear_value_mpc"),
+    ):
         run(name, "--study", study, "--quick", "--jobs", 1, "--out", quick, "--runs", quick / "runs" / folder)
     assert before == written()
 
@@ -112,14 +131,19 @@ def test_figures_are_drawn_from_the_committed_tables(step, tmp_path):
 
 def test_the_peers_of_the_benchmark(quick):
     """They are not in the requirements of the tests: then their rows say so. The committed table holds them."""
-    rows, committed = (list(csv.DictReader(open(folder / "results/benchmark_peers.csv"))) for folder in (quick, ROOT / "experiments"))
+    rows, committed = (
+        list(csv.DictReader(open(folder / "results/benchmark_peers.csv")))
+        for folder in (quick, ROOT / "experiments")
+    )
     for row in rows:
         assert float(row["ours_ms_median"]) > 0 and row["ours_failed"] == "0"
         assert row["peer_status"] != "not installed" or row["ratio_of_medians"] == ""
     for row in committed:
         if row["same_optimum"] and row["critic"] == "random":
             assert float(row["same_optimum"]) < 1e-4, row["peer"]
-        assert bool(row["ratio_of_medians"]) == (row["peer_failed"] == "0")  # no ratio where the peer did not converge
+        assert bool(row["ratio_of_medians"]) == (
+            row["peer_failed"] == "0"
+        )  # no ratio where the peer did not converge
 
 
 def test_training_beside_its_peer_counts_what_both_did(quick):
@@ -128,7 +152,14 @@ def test_training_beside_its_peer_counts_what_both_did(quick):
 
 
 def test_agents_are_needed_before_their_closed_loops(tmp_path):
-    command = [sys.executable, "experiments/linear_value_mpc.py", "--runs", str(tmp_path), "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        "experiments/linear_value_mpc.py",
+        "--runs",
+        str(tmp_path),
+        "--out",
+        str(tmp_path),
+    ]
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert out.returncode == 2 and "--study train" in out.stderr and "Traceback" not in out.stderr
 
@@ -145,7 +176,13 @@ def test_agents_are_needed_before_their_closed_loops(tmp_path):
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
-    command = [sys.executable, f"experiments/{name}.py", "--runs", str(tmp_path), *(a.format(tmp_path) for a in arguments)]
+    command = [
+        sys.executable,
+        f"experiments/{name}.py",
+        "--runs",
+        str(tmp_path),
+        *(a.format(tmp_path) for a in arguments),
+    ]
     out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert out.returncode == 2 and "Traceback" not in out.stderr
     assert all(word in out.stderr for word in words), out.stderr
@@ -162,7 +199,9 @@ def test_the_oracle_is_no_worse_than_any_controller():
     found = list(csv.DictReader(open(ROOT / "experiments/results/cstr_oracle.csv")))
     for row in found:
         weight, slack = float(row["weight"]), float(row["slack"])
-        assert float(row["objective"]) == pytest.approx(float(row["time_near_goal"]) - weight * slack, abs=1e-4)
+        assert float(row["objective"]) == pytest.approx(
+            float(row["time_near_goal"]) - weight * slack, abs=1e-4
+        )
 
 
 def test_the_tuned_benchmark_is_the_best_of_its_table():
@@ -181,11 +220,17 @@ def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
 
     from envs import cstr
 
-    problem, x0, psi = cstr_oracle.Oracle(20, compile=False), np.array([0.8, 0.4, 120.0, 118.0]), np.array([1.02, 0.95])
+    problem, x0, psi = (
+        cstr_oracle.Oracle(20, compile=False),
+        np.array([0.8, 0.4, 120.0, 118.0]),
+        np.array([1.02, 0.95]),
+    )
     guess = np.tile([20.0, -2000.0], (20, 1))
     u = problem.optimum(x0, psi, 5.0, guess)
     assert ((cstr.U_LOW - 1e-6 <= u) & (u <= cstr.U_HIGH + 1e-6)).all()
-    (near, _, slack), (near_guess, _, slack_guess) = (cstr_oracle.measure(x0, psi, actions) for actions in (u, guess))
+    (near, _, slack), (near_guess, _, slack_guess) = (
+        cstr_oracle.measure(x0, psi, actions) for actions in (u, guess)
+    )
     assert near - 5 * slack > near_guess - 5 * slack_guess
     assert -problem.objective == pytest.approx(near - 5 * slack, abs=1e-4)  # the model is the plant
 
@@ -212,7 +257,10 @@ def test_shipped_critics_are_the_first_seed_of_the_committed_table():
     for scenarios in ("robust", "nominal"):
         row = next(row for row in table if row["scenarios"] == scenarios and row["seed"] == "0")
         text = (ROOT / f"experiments/pretrained/cstr_{scenarios}.txt").read_text()
-        assert f"{float(row['robust_median_ape']):.2f} %" in text and f"{float(row['nominal_median_ape']):.2f} %" in text
+        assert (
+            f"{float(row['robust_median_ape']):.2f} %" in text
+            and f"{float(row['nominal_median_ape']):.2f} %" in text
+        )
     first = next(csv.DictReader(open(ROOT / "experiments/results/linear_value_mpc_training.csv")))
     text = (ROOT / "experiments/pretrained/linear_robust.txt").read_text()
     assert (first["n"], first["system"]) == ("32", "0") and f"{float(first['error_median']):.2f} %" in text

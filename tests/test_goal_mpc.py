@@ -29,16 +29,35 @@ CHAIN = np.array([[0.0, 1.0], [0.3, -0.2]])  # x' = CHAIN x + [0, psi] u
 
 def linear_plant(u_max=100.0, x_max=np.inf):
     """A double integrator's cousin as a plant module, exactly discretised by enough Runge-Kutta steps."""
-    plant = SimpleNamespace(ENV_ID="linear", STATE_NAMES=("a", "b"), DT=0.1, MODEL_SUBSTEPS=10, GOAL_INDEX=[0], X_LOW=np.full(2, -x_max),
-                            X_HIGH=np.full(2, x_max), INIT_LOW=-np.ones(2), INIT_HIGH=np.ones(2), U_LOW=np.array([-u_max]), ANGLES=[],
-                            U_HIGH=np.array([u_max]), PSI_NOMINAL=np.ones(1), GOAL_LOW=-np.ones(1), GOAL_HIGH=np.ones(1))  # fmt: skip
+    plant = SimpleNamespace(
+        ENV_ID="linear",
+        STATE_NAMES=("a", "b"),
+        DT=0.1,
+        MODEL_SUBSTEPS=10,
+        GOAL_INDEX=[0],
+        X_LOW=np.full(2, -x_max),
+        X_HIGH=np.full(2, x_max),
+        INIT_LOW=-np.ones(2),
+        INIT_HIGH=np.ones(2),
+        U_LOW=np.array([-u_max]),
+        ANGLES=[],
+        U_HIGH=np.array([u_max]),
+        PSI_NOMINAL=np.ones(1),
+        GOAL_LOW=-np.ones(1),
+        GOAL_HIGH=np.ones(1),
+    )
 
     def ode(x, u, psi, xp):
-        a, b = CHAIN[0, 0] * x[0] + CHAIN[0, 1] * x[1], CHAIN[1, 0] * x[0] + CHAIN[1, 1] * x[1] + psi[0] * u[0]
+        a, b = (
+            CHAIN[0, 0] * x[0] + CHAIN[0, 1] * x[1],
+            CHAIN[1, 0] * x[0] + CHAIN[1, 1] * x[1] + psi[0] * u[0],
+        )
         return ca.vertcat(a, b) if xp is ca else np.array([a, b])
 
     plant.ode = ode
-    plant.step = lambda x, u, psi: gm.envs.rk4(ode, np.asarray(x, float), np.atleast_1d(u), np.asarray(psi), 0.1, 10)
+    plant.step = lambda x, u, psi: gm.envs.rk4(
+        ode, np.asarray(x, float), np.atleast_1d(u), np.asarray(psi), 0.1, 10
+    )
     return plant
 
 
@@ -55,12 +74,19 @@ class Radau(gm.ScenarioMPC):
         tau, plant = ca.collocation_points(3, "radau"), self.plant
         C, D, _ = ca.collocation_coeff(tau)
         n_x, n_u = len(self.x_scale), len(self.u_scale)
-        x, u, psi = (ca.MX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("psi", self.scenarios.shape[1])))
+        x, u, psi = (
+            ca.MX.sym(name, n) for name, n in (("x", n_x), ("u", n_u), ("psi", self.scenarios.shape[1]))
+        )
         inside = ca.MX.sym("inside", n_x, 3)  # states at the collocation points
         points, action = ca.horzcat(x, inside), u * self.u_scale + self.u_center
-        slopes = [plant.ode(inside[:, j] * self.x_scale + self.x_center, action, psi, ca) / self.x_scale for j in range(3)]
+        slopes = [
+            plant.ode(inside[:, j] * self.x_scale + self.x_center, action, psi, ca) / self.x_scale
+            for j in range(3)
+        ]
         residual = ca.vec(points @ C - plant.DT * ca.horzcat(*slopes))
-        root = ca.rootfinder("root", "newton", {"x": ca.vec(inside), "p": ca.vertcat(x, u, psi), "g": residual})
+        root = ca.rootfinder(
+            "root", "newton", {"x": ca.vec(inside), "p": ca.vertcat(x, u, psi), "g": residual}
+        )
         found = ca.reshape(root(ca.repmat(x, 3, 1), ca.vertcat(x, u, psi)), n_x, 3)
         return ca.Function("step", [x, u, psi], [ca.horzcat(x, found) @ D])
 
@@ -96,7 +122,16 @@ def test_linear_quadratic_problem_has_riccatis_solution(kind):
     S = np.vstack([A.T @ Q @ B, [[-R]]])
     P = solve_discrete_are(AA, BB, QQ, RR, s=S)
     K = np.linalg.solve(RR + BB.T @ P @ BB, BB.T @ P @ AA + S.T)
-    mpc = kind(plant, 80, np.ones((1, 1)), quadratic(plant, Q)[0], goal=[0.0], change_weight=[R], compile=False, ipopt={"tol": 1e-9})
+    mpc = kind(
+        plant,
+        80,
+        np.ones((1, 1)),
+        quadratic(plant, Q)[0],
+        goal=[0.0],
+        change_weight=[R],
+        compile=False,
+        ipopt={"tol": 1e-9},
+    )
     x0 = np.array([0.7, -0.4])
     objective, u = first_solve(mpc, x0)
     start = np.append(x0, 0.0)
@@ -114,7 +149,9 @@ def test_identical_scenarios_and_one_scenario_give_the_nominal_controller():
     x0 = NEAR_UPRIGHT
     nominal = first_solve(pendulum(objective="steep", ipopt={"tol": 1e-9}), x0)
     for scenarios in (np.ones((3, 3)), np.ones((1, 3))):
-        objective, u = first_solve(pendulum(objective="steep", scenarios=scenarios, robust_horizon=1, ipopt={"tol": 1e-9}), x0)
+        objective, u = first_solve(
+            pendulum(objective="steep", scenarios=scenarios, robust_horizon=1, ipopt={"tol": 1e-9}), x0
+        )
         assert objective == pytest.approx(nominal[0], rel=1e-6)
         np.testing.assert_allclose(u, nominal[1], atol=1e-3)
 
@@ -129,7 +166,12 @@ def test_a_tree_that_branches_twice():
     for t in range(3):
         for j in range(nodes[t + 1]):
             parent = j // 2 if t < 2 else j
-            expected = dp.step(states[t][:, parent], predicted["u"][t][:, parent], controller.scenarios[j % 2], dp.MODEL_SUBSTEPS)
+            expected = dp.step(
+                states[t][:, parent],
+                predicted["u"][t][:, parent],
+                controller.scenarios[j % 2],
+                dp.MODEL_SUBSTEPS,
+            )
             np.testing.assert_allclose(states[t + 1][:, j], expected, atol=1e-6)
 
 
@@ -139,8 +181,12 @@ def test_robust_problem_equals_its_twin_in_the_deployed_controller():
     stage = ca.Function("stage", [x, g], [-ca.exp(-((x[1] - g) ** 2) / 0.02)])
     same = 0
     for x0 in (CSTR_X0, np.array([0.8, 0.6, 145.0, 141.0])):  # the second outside the bounds
-        twin = deploy.ScenarioMPC(cstr, 5, cstr.SCENARIOS["mpc"], stage, goal=[0.65], iterations=50, compile=False)
-        mine = gm.ScenarioMPC(cstr, 5, cstr.SCENARIOS["mpc"], stage, goal=[0.65], robust_horizon=1, compile=False)
+        twin = deploy.ScenarioMPC(
+            cstr, 5, cstr.SCENARIOS["mpc"], stage, goal=[0.65], iterations=50, compile=False
+        )
+        mine = gm.ScenarioMPC(
+            cstr, 5, cstr.SCENARIOS["mpc"], stage, goal=[0.65], robust_horizon=1, compile=False
+        )
         objective, u = first_solve(mine, x0)
         v = twin.make_step(x0)
         gap = (objective - twin.stats["cost"]) / (1 + abs(objective))
@@ -160,19 +206,33 @@ def test_objective_is_that_of_a_naive_loop(robust_horizon):
     terminal = ca.Function("t", [x, g], [ca.sum1((x / span) ** 3) + g**2 * x[0]])
     price, change = rng.uniform(1, 2, (2, 4)), rng.uniform(0, 1e-3, 2)
     price[0, 2] = 0.0  # no lower bound for T_R
-    mpc = gm.ScenarioMPC(cstr, N, cstr.SCENARIOS["mpc"][[0, 5]], stage, terminal, goal=[0.65], robust_horizon=robust_horizon,
-                         slack_price=price, change_weight=change, compile=False)  # fmt: skip
+    mpc = gm.ScenarioMPC(
+        cstr,
+        N,
+        cstr.SCENARIOS["mpc"][[0, 5]],
+        stage,
+        terminal,
+        goal=[0.65],
+        robust_horizon=robust_horizon,
+        slack_price=price,
+        change_weight=change,
+        compile=False,
+    )
     nodes = [S ** min(t, robust_horizon) for t in range(N + 1)]
     goal, before = rng.uniform(-1, 1, (1, N)), rng.uniform(cstr.U_LOW, cstr.U_HIGH)
     states = [rng.uniform(cstr.X_LOW - span, cstr.X_HIGH + span, (n, 4)) for n in nodes[1:]]
     u = [rng.uniform(cstr.U_LOW, cstr.U_HIGH, (n, 2)) for n in nodes[:-1]]
     function = ca.Function("f", [mpc.problem["x"], mpc.problem["p"]], [mpc.problem["f"]])
     plan = mpc.vector(np.concatenate(states), np.concatenate(u))
-    objective = float(function(plan, np.concatenate([envs.sample_states(cstr, rng, 1)[0], before, goal.ravel()])))
+    objective = float(
+        function(plan, np.concatenate([envs.sample_states(cstr, rng, 1)[0], before, goal.ravel()]))
+    )
     expected = 0.0
     for t in range(1, N + 1):
         for x in states[t - 1]:
-            expected += float(stage(x, goal[0, t - 1])) / nodes[t] + (float(terminal(x, goal[0, -1])) / nodes[t]) * (t == N)
+            expected += float(stage(x, goal[0, t - 1])) / nodes[t] + (
+                float(terminal(x, goal[0, -1])) / nodes[t]
+            ) * (t == N)
             outside = np.maximum(cstr.X_LOW - x, 0), np.maximum(x - cstr.X_HIGH, 0)
             expected += sum((price[side] * outside[side]).sum() for side in (0, 1)) / nodes[t]
     for t in range(N):
@@ -185,7 +245,9 @@ def test_objective_is_that_of_a_naive_loop(robust_horizon):
 def test_hard_bounds_hold_in_a_tree_from_the_first_prediction_on():
     x, g = ca.SX.sym("x", 4), ca.SX.sym("g", 1)
     heat = ca.Function("heat", [x, g], [-x[2] / 10])
-    mpc = gm.ScenarioMPC(cstr, 3, cstr.SCENARIOS["mpc"], heat, goal=[0.65], robust_horizon=1, slack_price=np.inf, compile=False)
+    mpc = gm.ScenarioMPC(
+        cstr, 3, cstr.SCENARIOS["mpc"], heat, goal=[0.65], robust_horizon=1, slack_price=np.inf, compile=False
+    )
     first_solve(mpc, np.array([1.2, 0.6, 137.0, 137.0]))
     states = np.hstack(mpc.prediction()["x"])
     assert states.shape == (4, 27) and 139.9 < states[2].max() < 140 + 1e-4
@@ -214,7 +276,9 @@ def test_with_preview_the_controller_prepares_for_a_goal_that_it_otherwise_learn
     cost = ca.Function("c", [x, g], [(x[0] - g) ** 2])
     mpc = gm.ScenarioMPC(plant, 5, np.ones((1, 1)), cost, goal=[0.0], change_weight=[1e-4], compile=False)
     goals = np.repeat([[0.0], [1.0]], [6, 6], axis=0)
-    early, late = (gm.simulate(mpc, np.zeros(2), np.ones(1), goals, preview)[0][:, 0] for preview in (True, False))
+    early, late = (
+        gm.simulate(mpc, np.zeros(2), np.ones(1), goals, preview)[0][:, 0] for preview in (True, False)
+    )
     assert np.abs(late[:7]).max() < 1e-3 < np.abs(early[:7]).max() and late[-1] == pytest.approx(1, abs=0.05)
 
 
@@ -240,7 +304,9 @@ def test_no_price_ignores_the_bound():
 
 def test_the_pendulum_holds_still_where_its_rods_stand_or_hang():
     assert (
-        gm.envs.can_hold(dp, np.array([[0.0, 0.0], [np.pi, 0.0], [0.0, -np.pi], [0.3, 0.0], [np.pi, 1.0]])).tolist()
+        gm.envs.can_hold(
+            dp, np.array([[0.0, 0.0], [np.pi, 0.0], [0.0, -np.pi], [0.3, 0.0], [np.pi, 1.0]])
+        ).tolist()
         == [True] * 3 + [False] * 2
     )
 
@@ -349,7 +415,9 @@ def test_every_status_is_read():
         controller.prediction()
 
 
-@pytest.mark.parametrize("state", [[0, 3, np.nan, 0, 0, 0], [0, 3, 3, 0, 0], [[0, 3, 3, 0, 0, 0]], [np.inf, 3, 3, 0, 0, 0]])
+@pytest.mark.parametrize(
+    "state", [[0, 3, np.nan, 0, 0, 0], [0, 3, 3, 0, 0], [[0, 3, 3, 0, 0, 0]], [np.inf, 3, 3, 0, 0, 0]]
+)
 def test_a_state_that_is_none_is_refused(state):
     with pytest.raises(ValueError, match="state"):
         pendulum(2).make_step(state)
@@ -358,7 +426,12 @@ def test_a_state_that_is_none_is_refused(state):
 def test_problems_that_cannot_be_built_are_refused():
     with pytest.raises(ValueError, match="horizon is 0"):
         pendulum(0)
-    for options in (dict(scenarios=np.ones((1, 2))), dict(slack_price=-1.0), dict(slack_price=np.ones(3)), dict(change_weight=np.nan)):
+    for options in (
+        dict(scenarios=np.ones((1, 2))),
+        dict(slack_price=-1.0),
+        dict(slack_price=np.ones(3)),
+        dict(change_weight=np.nan),
+    ):
         with pytest.raises(ValueError, match=next(iter(options))):
             pendulum(3, **options)
 
@@ -387,7 +460,15 @@ def test_goal_schedules():
     np.testing.assert_allclose(goals, [[0, np.pi]] * 3 + [[1.5, -0.5]] * 2 + [[0, 0]])
     np.testing.assert_allclose(gm.goal_schedule(cstr, ("0.7",), 2), [[0.7], [0.7]])
     np.testing.assert_allclose(gm.goal_schedule(cstr, (), 1), [cstr.EVAL_GOAL])
-    bad_schedules = ["sideways"], ["1"], ["1,2,3"], ["up-up", "up-down"], ["up-up", "0,0@4", "up-up@4"], ["9,0"], ["up-up", "0,0@x"]
+    bad_schedules = (
+        ["sideways"],
+        ["1"],
+        ["1,2,3"],
+        ["up-up", "up-down"],
+        ["up-up", "0,0@4", "up-up@4"],
+        ["9,0"],
+        ["up-up", "0,0@x"],
+    )
     for bad in (*bad_schedules, ["up-up@2"], ["up-up", "up-down@6"]):
         with pytest.raises(ValueError, match="--goal"):
             gm.goal_schedule(dp, bad, 6)
@@ -399,12 +480,16 @@ def test_objectives_are_those_of_the_paper():
     assert float(gm.costs(dp, "quadratic")[0](x, goal)) == pytest.approx(squared / 2)
     assert float(gm.costs(dp, "goal")[0](x, goal)) == pytest.approx(-np.exp(-squared / 2))
     assert float(gm.costs(dp, "goal", 0.5)[0](x, goal)) == pytest.approx(-np.exp(-squared))
-    assert float(gm.costs(dp, "expert")[0](x, goal)) == pytest.approx(float(dp.kinetic_energy(x) - dp.potential_energy(x)))
+    assert float(gm.costs(dp, "expert")[0](x, goal)) == pytest.approx(
+        float(dp.kinetic_energy(x) - dp.potential_energy(x))
+    )
 
 
 def test_the_nominal_plant_leads_every_tree():
     for scenarios, size in {"nominal": 1, "mpc": 9, "robust": 101}.items():
-        mpc = gm.build_controller(gm.Args(env="cstr", horizon=1, scenarios=scenarios, compile=False, robust_horizon=1))
+        mpc = gm.build_controller(
+            gm.Args(env="cstr", horizon=1, scenarios=scenarios, compile=False, robust_horizon=1)
+        )
         np.testing.assert_array_equal(mpc.scenarios[0], cstr.PSI_NOMINAL)
         assert len(mpc.scenarios) == size
 
@@ -420,7 +505,9 @@ def test_closed_loop_measures_are_those_of_a_naive_loop():
         near += np.exp(-sum((1 - np.cos(x[t + 1][1 + j] - goals[t][j])) ** 2 for j in range(2)) / 0.02)
         variation, before = variation + abs(u[t][0] - before), u[t][0]
     row = gm.summary(dp, x, u, goals, log)
-    assert row["time_near_goal"] == pytest.approx(near, abs=1e-5) and row["action_total_variation"] == pytest.approx(variation, abs=1e-5)
+    assert row["time_near_goal"] == pytest.approx(near, abs=1e-5) and row[
+        "action_total_variation"
+    ] == pytest.approx(variation, abs=1e-5)
     assert predicted.shape == (6, 9, 6)
 
 
@@ -441,17 +528,28 @@ COLUMNS = (
 
 
 def run_script(*arguments):
-    return subprocess.run([sys.executable, "goal_mpc.py", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "goal_mpc.py", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 @pytest.mark.parametrize(
     "extra, files",
     [
-        (["--env", "double_pendulum", "--episodes", "2", "--animate"], {"results.csv", "trajectories.npz", "episode.png", "episode.gif"}),
-        (["--env", "cstr", "--robust-horizon", "1", "--constraints", "hard", "--objective", "quadratic"],
-         {"results.csv", "trajectories.npz", "episode.png"}),
+        (
+            ["--env", "double_pendulum", "--episodes", "2", "--animate"],
+            {"results.csv", "trajectories.npz", "episode.png", "episode.gif"},
+        ),
+        (
+            ["--env", "cstr", "--robust-horizon", "1", "--constraints", "hard", "--objective", "quadratic"],
+            {"results.csv", "trajectories.npz", "episode.png"},
+        ),
     ],
-)  # fmt: skip
+)
 def test_command_line_end_to_end(extra, files, tmp_path):
     out = run_script("--horizon", 6, "--steps", 4, "--no-compile", "--out", tmp_path / "o", *extra)
     assert out.returncode == 0, out.stderr
@@ -499,7 +597,9 @@ def test_bad_arguments_get_one_sentence(arguments, words, tmp_path):
     assert "\n" not in sentence and all(word in sentence for word in words), sentence
 
 
-@pytest.mark.parametrize("arguments, word", [(["--horizon", "0"], "error: --horizon is 0"), (["--objective", "best"], "best")])
+@pytest.mark.parametrize(
+    "arguments, word", [(["--horizon", "0"], "error: --horizon is 0"), (["--objective", "best"], "best")]
+)
 def test_bad_arguments_end_with_exit_code_2(arguments, word):
     out = run_script(*arguments)
     assert out.returncode == 2 and "Traceback" not in out.stderr and word in out.stderr
@@ -518,7 +618,9 @@ def test_default_arguments_are_accepted():
 
 def test_an_interrupt_ends_the_program_at_once():
     command = [sys.executable, "-u", "goal_mpc.py", "--no-compile", "--steps", "100000"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     assert "variables" in process.stdout.readline()  # built; the next thing is a solve
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=10) == -signal.SIGINT

@@ -38,10 +38,14 @@ def test_random_systems_are_what_the_appendix_describes(n):
         assert plant.A.shape == (n, n) and np.abs(np.linalg.eigvals(plant.A)).max() <= 1.1 + 1e-9
         assert (np.triu(plant.transform, 1) == 0).all() and (np.diag(plant.transform) > 0).all()
         assert np.linalg.cond(plant.transform) <= 10
-        m = plant.transform @ plant.A @ np.linalg.inv(plant.transform)  # undo the similarity: singular values in [0.11, 1.1]
+        m = (
+            plant.transform @ plant.A @ np.linalg.inv(plant.transform)
+        )  # undo the similarity: singular values in [0.11, 1.1]
         values = np.linalg.svd(m, compute_uv=False)
         assert values.min() >= 0.11 - 1e-9 and values.max() <= 1.1 + 1e-9
-    np.testing.assert_array_equal(plant.A, linear.Linear(*linear.random_matrix(n, np.random.default_rng([n, 4]))).A)  # seeded
+    np.testing.assert_array_equal(
+        plant.A, linear.Linear(*linear.random_matrix(n, np.random.default_rng([n, 4]))).A
+    )  # seeded
     assert not np.array_equal(plant.A, linear.make(n, 0).A)
     assert linear.make(n, 4) is plant
 
@@ -57,9 +61,13 @@ def test_next_state_serves_numpy_torch_and_casadi_and_equals_step():
     expected = x @ plant.A.T + u
     np.testing.assert_allclose(plant.step(x, u), expected)
     np.testing.assert_allclose(plant.next_state(x.T, u.T).T, expected)
-    np.testing.assert_allclose(plant.next_state(torch.tensor(x.T), torch.tensor(u.T), xp=torch).numpy().T, expected)
+    np.testing.assert_allclose(
+        plant.next_state(torch.tensor(x.T), torch.tensor(u.T), xp=torch).numpy().T, expected
+    )
     xs, us = ca.MX.sym("x", 3), ca.MX.sym("u", 3)
-    np.testing.assert_allclose(np.array(ca.Function("f", [xs, us], [plant.next_state(xs, us, xp=ca)]).map(5)(x.T, u.T)).T, expected)
+    np.testing.assert_allclose(
+        np.array(ca.Function("f", [xs, us], [plant.next_state(xs, us, xp=ca)]).map(5)(x.T, u.T)).T, expected
+    )
 
 
 # The discounted regulator
@@ -73,7 +81,11 @@ def test_regulator_against_scipy_and_the_bellman_equation(gamma):
     m, r = np.diag(rng.uniform(0.5, 2, 5)), np.diag(rng.uniform(0.5, 2, 2))
     p, k = linear.discounted_lqr(a, b, m, r, gamma)
     np.testing.assert_allclose(p, solve_discrete_are(np.sqrt(gamma) * a, np.sqrt(gamma) * b, m, r), rtol=1e-8)
-    dare = m + gamma * a.T @ p @ a - gamma**2 * a.T @ p @ b @ np.linalg.inv(r + gamma * b.T @ p @ b) @ b.T @ p @ a  # as printed
+    dare = (
+        m
+        + gamma * a.T @ p @ a
+        - gamma**2 * a.T @ p @ b @ np.linalg.inv(r + gamma * b.T @ p @ b) @ b.T @ p @ a
+    )  # as printed
     np.testing.assert_allclose(p, dare, rtol=1e-8)
     np.testing.assert_allclose(k, gamma * np.linalg.inv(r + gamma * b.T @ p @ b) @ b.T @ p @ a, rtol=1e-8)
     iterate = np.zeros((5, 5))
@@ -165,7 +177,9 @@ def test_objective_and_constraints_are_those_of_the_paper(objective):
     slack = sum(gamma**t * 0.7 * outside[t] for t in range(1, N + 1))
     parameters = np.concatenate([x_now, np.zeros(3), np.repeat(goal[:, None], N, axis=1).ravel("F")])
     value = ca.Function("f", [mpc.problem["x"], mpc.problem["p"]], [mpc.problem["f"]])(w, parameters)
-    assert float(value) == pytest.approx(sum(gamma**t * cost for t, cost in enumerate(costs)) + slack, rel=1e-12)
+    assert float(value) == pytest.approx(
+        sum(gamma**t * cost for t, cost in enumerate(costs)) + slack, rel=1e-12
+    )
 
 
 def test_a_goal_off_the_origin_is_held():
@@ -200,7 +214,9 @@ def test_jensen_sides_are_the_printed_formula_and_a_wrong_rho_is_caught(gamma):
     def printed(costs, rho_inverse):
         N = costs.shape[-1] - 1
         powers = gamma ** np.arange(N + 1)
-        return -rho_inverse * (powers * costs).sum(-1), np.log(rho_inverse * (powers * np.exp(-costs)).sum(-1))
+        return -rho_inverse * (powers * costs).sum(-1), np.log(
+            rho_inverse * (powers * np.exp(-costs)).sum(-1)
+        )
 
     costs, N = some_costs(1), 10
     right_rho = (1 - gamma) / (1 - gamma ** (N + 1))
@@ -219,7 +235,9 @@ def test_trajectory_costs_are_the_controllers_own():
         mpc = lq_mpc(plant, objective=objective)
         mpc.make_step(x0)
         sides = study.plan_sides(mpc, x0)
-        expected = -mpc.objective / 7 if objective == "quadratic" else np.log(-mpc.objective / 7)  # no bound is violated here
+        expected = (
+            -mpc.objective / 7 if objective == "quadratic" else np.log(-mpc.objective / 7)
+        )  # no bound is violated here
         assert sides[side] == pytest.approx(expected, abs=1e-6)
 
 
@@ -227,17 +245,25 @@ def test_trajectory_costs_are_the_controllers_own():
 def test_closed_loops_satisfy_jensen_and_goal_conditioned_plans_have_the_larger_right_side(n):
     """The second half is no theorem: a local optimum or a saved violation may break it. On these systems nothing does."""
     settings = study.BASE | {"steps": 12}
-    rows = [row for system in range(2) for row in study.run_system(("base", tuple(settings.items()), n, system, 2))]
+    rows = [
+        row
+        for system in range(2)
+        for row in study.run_system(("base", tuple(settings.items()), n, system, 2))
+    ]
     assert all(row["jensen_log_left"] < row["jensen_log_right"] <= 0 for row in rows)
     goal = [row for row in rows if row["controller"] == "goal"]
     assert [row["plans_compared"] for row in goal] == [12] * 4
     assert sum(row["plans_worse"] + row["plans_costlier"] for row in goal) == 0
-    plant = study.make_plant(n, 0, settings)  # and that count is not vacuous: the roles exchanged, LQ-MPC's plans are worse
+    plant = study.make_plant(
+        n, 0, settings
+    )  # and that count is not vacuous: the roles exchanged, LQ-MPC's plans are worse
     lq, mpc = (study.controller(plant, objective, settings) for objective in study.CONTROLLERS)
     x0 = envs.sample_states(plant, np.random.default_rng([n, 0, 1]), 1)[0]
     for controller in (lq, mpc):
         controller.make_step(x0)
-    (side, cost), (best_side, best_cost) = (study.judged_plan(controller, x0, settings["price"]) for controller in (lq, mpc))
+    (side, cost), (best_side, best_cost) = (
+        study.judged_plan(controller, x0, settings["price"]) for controller in (lq, mpc)
+    )
     assert side < best_side - 1e-4 and cost > best_cost + 1e-4
     assert best_cost == pytest.approx(mpc.objective, abs=1e-4)  # slack ends near, not at, zero
 
@@ -278,13 +304,34 @@ def test_a_plant_that_is_not_there_is_one_sentence():
 
 def test_training_and_deployment_run_on_it(tmp_path):
     """The checkpoint knows its system, and every controller runs on it."""
-    run = training.main(training.Args(env="linear", dim=3, system=5, total_timesteps=2_000, learning_starts=500, num_envs=8, batch_size=32,
-                                      eval_episodes=10, hidden=(16, 16), out=tmp_path))  # fmt: skip
+    run = training.main(
+        training.Args(
+            env="linear",
+            dim=3,
+            system=5,
+            total_timesteps=2_000,
+            learning_starts=500,
+            num_envs=8,
+            batch_size=32,
+            eval_episodes=10,
+            hidden=(16, 16),
+            out=tmp_path,
+        )
+    )
     policy = training.load_policy(run / "checkpoint.pt")
     assert policy.plant is envs.load("linear", dim=3, system=5)
     controllers = ("actor", "nominal_mpc", "goal_mpc", "rl_mpc")
-    args = deploy.Args(env="linear", critic=run / "checkpoint.pt", horizon=2, episodes=1, steps=4, jobs=1, compile=False,
-                       controllers=controllers, out=tmp_path / "deployed")  # fmt: skip
+    args = deploy.Args(
+        env="linear",
+        critic=run / "checkpoint.pt",
+        horizon=2,
+        episodes=1,
+        steps=4,
+        jobs=1,
+        compile=False,
+        controllers=controllers,
+        out=tmp_path / "deployed",
+    )
     rows = deploy.main(args)
     assert [row["controller"] for row in rows] == list(controllers)
     assert all(np.isfinite(row["time_near_goal"]) and row["fell_back"] == 0 for row in rows)
@@ -302,9 +349,21 @@ def test_with_a_quadratic_critic_one_iteration_finds_the_regulators_action(given
     V = ca.Function("V", [x, g], [-ca.bilin(ca.DM(p), x - g, x - g) / 1000])
     stage = ca.Function("stage", [x, g], [0 * x[0]])
     derivatives = [V(x, g), ca.gradient(V(x, g), x), ca.hessian(V(x, g), x)[0]]
-    mpc = deploy.ScenarioMPC(plant, 1, plant.SCENARIOS["mpc"], stage, V, goal=goal, change_weight=1e-3, slack_price=0.0, compile=False,
-                             expansion=ca.Function("expansion", [x, g, m], derivatives) if given else None)  # fmt: skip
-    x0 = 0.02 * np.array([1, -1, 2, 0.5, -2])  # u before is zero: with N = 1 the change is |u|^2, so that the costs are the regulator's
+    mpc = deploy.ScenarioMPC(
+        plant,
+        1,
+        plant.SCENARIOS["mpc"],
+        stage,
+        V,
+        goal=goal,
+        change_weight=1e-3,
+        slack_price=0.0,
+        compile=False,
+        expansion=ca.Function("expansion", [x, g, m], derivatives) if given else None,
+    )
+    x0 = 0.02 * np.array(
+        [1, -1, 2, 0.5, -2]
+    )  # u before is zero: with N = 1 the change is |u|^2, so that the costs are the regulator's
     u = mpc.make_step(x0)
     expected = -np.linalg.solve(np.eye(5) + p, p @ plant.A @ x0)
     np.testing.assert_allclose(u, expected, atol=1e-6)
@@ -321,7 +380,9 @@ def test_controllers_keep_what_casadi_calls_back(checkpoint):
 
 
 def test_a_settled_plant_starts_from_the_last_plan(checkpoint):
-    mpc = deploy.build_controller("rl_mpc", deploy.Args(critic=checkpoint, horizon=3, compile=False, iterations=50))
+    mpc = deploy.build_controller(
+        "rl_mpc", deploy.Args(critic=checkpoint, horizon=3, compile=False, iterations=50)
+    )
     x = np.array([0.8, 0.5, 110.0, 105.0])
     first = mpc.make_step(x)
     iterations, cost = mpc.stats["iterations"], mpc.stats["cost"]
@@ -336,7 +397,10 @@ def test_a_settled_plant_starts_from_the_last_plan(checkpoint):
 def test_default_networks_are_the_papers():
     args = training.Args(env="linear", dim=32)
     agent = training.SAC(args, envs.load("linear", **args.plant_options))
-    sizes = [sum(p.numel() for p in agent.actor.parameters()), sum(p.numel() for p in agent.critic.parameters()) // 2]
+    sizes = [
+        sum(p.numel() for p in agent.actor.parameters()),
+        sum(p.numel() for p in agent.critic.parameters()) // 2,
+    ]
     assert args.hidden == (256, 256) and args.total_timesteps == 500_000
     assert all(90_000 < size < 100_000 for size in sizes)
     assert training.Args().hidden == (64, 64) and training.Args(hidden=(8,), env="linear").hidden == (8,)
@@ -359,17 +423,40 @@ def test_the_shipped_critic_holds_the_origin_and_beats_its_actor():
 
 
 def run_script(name, *arguments):
-    return subprocess.run([sys.executable, name, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, name, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
 
 
 @pytest.mark.parametrize("objective", ["quadratic", "goal"])
 def test_goal_mpc_end_to_end(tmp_path, objective):
-    out = run_script("goal_mpc.py", "--env", "linear", "--dim", 14, "--system", 3, "--objective", objective, "--horizon", 6, "--steps", 8,
-                     "--episodes", 2, "--out", tmp_path)  # fmt: skip
+    out = run_script(
+        "goal_mpc.py",
+        "--env",
+        "linear",
+        "--dim",
+        14,
+        "--system",
+        3,
+        "--objective",
+        objective,
+        "--horizon",
+        6,
+        "--steps",
+        8,
+        "--episodes",
+        2,
+        "--out",
+        tmp_path,
+    )
     assert out.returncode == 0, out.stderr
     rows = list(csv.DictReader(open(tmp_path / "results.csv")))
-    assert [row["env"] for row in rows] == ["linear"] * 2 and all(float(row["time_near_goal"]) > 2 for row in rows)
-    assert (tmp_path / "episode.png").stat().st_size > 10_000  # 28 states and actions, of which some are drawn
+    assert [row["env"] for row in rows] == ["linear"] * 2 and all(
+        float(row["time_near_goal"]) > 2 for row in rows
+    )
+    assert (
+        tmp_path / "episode.png"
+    ).stat().st_size > 10_000  # 28 states and actions, of which some are drawn
 
 
 @pytest.mark.parametrize(

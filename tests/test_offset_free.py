@@ -25,8 +25,16 @@ PINNED = [6.503921523392776, 2.535779312510386, 303.249091002583, 285.5658392959
 @pytest.fixture(scope="module")
 def observing(tmp_path_factory):
     """A checkpoint of a hardly trained agent that observes the mismatch."""
-    args = training.Args(total_timesteps=1_600, learning_starts=500, eval_every=0, eval_episodes=5, hidden=(16, 16), observe_mismatch=True,
-                         scenario_hold="episode", out=tmp_path_factory.mktemp("observing"))  # fmt: skip
+    args = training.Args(
+        total_timesteps=1_600,
+        learning_starts=500,
+        eval_every=0,
+        eval_episodes=5,
+        hidden=(16, 16),
+        observe_mismatch=True,
+        scenario_hold="episode",
+        out=tmp_path_factory.mktemp("observing"),
+    )
     return training.main(args) / "checkpoint.pt"
 
 
@@ -46,7 +54,9 @@ def test_the_mismatch_is_exactly_zero_on_the_nominal_plant():
 
 
 def test_the_mismatch_is_that_of_a_naive_loop_and_zero_after_a_reset():
-    vec = gym.make_vec(cstr.ENV_ID, num_envs=3, observe_mismatch=True, scenario_hold="episode", max_episode_steps=4).unwrapped
+    vec = gym.make_vec(
+        cstr.ENV_ID, num_envs=3, observe_mismatch=True, scenario_hold="episode", max_episode_steps=4
+    ).unwrapped
     obs, _ = vec.reset(seed=1)
     psi = None
     for t in range(12):
@@ -71,9 +81,13 @@ def test_without_the_flags_nothing_changes():
     last = [vec.step(np.full((3, 2), [20.0, -1000.0]))[0]["observation"] for _ in range(55)][-1]
     np.testing.assert_allclose(last.sum(axis=0), PINNED, rtol=1e-10)
     plain = deploy.build_controller("rl_mpc", deploy.Args(horizon=1, compile=False))
-    free = deploy.build_controller("rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True, spread=1.0, filter_gain=0.3))
+    free = deploy.build_controller(
+        "rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True, spread=1.0, filter_gain=0.3)
+    )
     assert plain.estimator.kind is None and free.estimator.kind == "disturbance"
-    assert (plain.scenarios == cstr.SCENARIOS["mpc"]).all() and (free.scenarios == cstr.SCENARIOS["mpc"]).all()
+    assert (plain.scenarios == cstr.SCENARIOS["mpc"]).all() and (
+        free.scenarios == cstr.SCENARIOS["mpc"]
+    ).all()
     # with nothing estimated yet the first step is the same, and the second one is not
     np.testing.assert_array_equal(plain.make_step(NEAR), free.make_step(NEAR))
     assert plain.stats["cost"] == free.stats["cost"]
@@ -84,18 +98,23 @@ def test_without_the_flags_nothing_changes():
 
 def test_the_arguments_reach_the_controllers(observing):
     for name in ("nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"):
-        controller = deploy.build_controller(name, deploy.Args(horizon=1, compile=False, offset_free=True, filter_gain=0.3))
+        controller = deploy.build_controller(
+            name, deploy.Args(horizon=1, compile=False, offset_free=True, filter_gain=0.3)
+        )
         assert (controller.estimator.kind, controller.estimator.gain) == ("disturbance", 0.3)
         if name != "nominal_mpc":
             half = cstr.PSI_NOMINAL + 0.5 * (cstr.SCENARIOS["mpc"] - cstr.PSI_NOMINAL)
             np.testing.assert_array_equal(controller.scenarios, half)
     for name, horizon in (("actor", 1), ("rl_mpc", 0), ("rl_mpc", 1)):
-        controller = deploy.build_controller(name, deploy.Args(horizon=horizon, compile=False, critic=observing, filter_gain=0.3))
+        controller = deploy.build_controller(
+            name, deploy.Args(horizon=horizon, compile=False, critic=observing, filter_gain=0.3)
+        )
         assert (controller.estimator.kind, controller.estimator.gain) == ("mismatch", 0.3)
 
 
 @pytest.mark.parametrize(
-    "name, horizon, offset_free", [("rl_mpc", 1, True), ("rl_mpc", 1, False), ("rl_mpc", 0, False), ("actor", 1, False)]
+    "name, horizon, offset_free",
+    [("rl_mpc", 1, True), ("rl_mpc", 1, False), ("rl_mpc", 0, False), ("actor", 1, False)],
 )
 def test_an_episode_starts_with_nothing_estimated(name, horizon, offset_free, observing):
     args = deploy.Args(horizon=horizon, compile=False, offset_free=offset_free, critic=observing)
@@ -107,7 +126,10 @@ def test_an_episode_starts_with_nothing_estimated(name, horizon, offset_free, ob
 @pytest.mark.parametrize("name, horizon", [("rl_mpc", 0), ("actor", 1)])
 def test_actions_depend_on_the_mismatch_that_the_critic_observes(name, horizon):
     critic = ROOT / "experiments/pretrained/cstr_offset_free.pt"
-    controller, actions = deploy.build_controller(name, deploy.Args(horizon=horizon, compile=False, critic=critic)), []
+    controller, actions = (
+        deploy.build_controller(name, deploy.Args(horizon=horizon, compile=False, critic=critic)),
+        [],
+    )
     for difference in (0 * cstr.MISMATCH_SCALE, cstr.MISMATCH_SCALE):
         controller.estimator.difference = difference
         controller.estimator.before = None
@@ -116,7 +138,12 @@ def test_actions_depend_on_the_mismatch_that_the_critic_observes(name, horizon):
 
 
 def test_the_terminal_value_takes_the_mismatch_at_every_leaf(observing):
-    mpc, costs = deploy.build_controller("rl_mpc", deploy.Args(horizon=2, compile=False, critic=observing, iterations=0)), []
+    mpc, costs = (
+        deploy.build_controller(
+            "rl_mpc", deploy.Args(horizon=2, compile=False, critic=observing, iterations=0)
+        ),
+        [],
+    )
     V = deploy.export(deploy.load_critic(observing, "cstr"))[2]
     plan = np.random.default_rng(0).uniform(-0.5, 0.5, size=(mpc.tree.inner, 2))
     for difference in (0 * cstr.MISMATCH_SCALE, cstr.MISMATCH_SCALE):
@@ -127,7 +154,9 @@ def test_the_terminal_value_takes_the_mismatch_at_every_leaf(observing):
         costs.append(mpc.stats["cost"])
     m, leaves = np.full(4, np.tanh(1.0)), mpc.prediction()["x"][-1].T
     expected = np.mean([float(V(x, mpc.goal, 0 * m) - V(x, mpc.goal, m)) for x in leaves])
-    assert len(leaves) == 9 and costs[1] - costs[0] == pytest.approx(expected, abs=1e-9) and abs(expected) > 1e-3
+    assert (
+        len(leaves) == 9 and costs[1] - costs[0] == pytest.approx(expected, abs=1e-9) and abs(expected) > 1e-3
+    )
 
 
 def test_a_disturbance_moves_the_first_prediction_by_itself_and_shifted_parameters_are_predicted_with():
@@ -141,7 +170,9 @@ def test_a_disturbance_moves_the_first_prediction_by_itself_and_shifted_paramete
         for predicted, scenario in zip(mpc.prediction()["x"][0].T, mpc.scenarios):
             expected = cstr.step(x, u, scenario + known.shift, substeps=4) + known.disturbance
             np.testing.assert_allclose(predicted, expected, rtol=1e-9)
-        assert known.disturbance.any() == (estimate == "disturbance") and known.shift.any() == (estimate == "parameters")
+        assert known.disturbance.any() == (estimate == "disturbance") and known.shift.any() == (
+            estimate == "parameters"
+        )
 
 
 def test_resuming_a_run_with_held_scenarios_keeps_them(tmp_path):
@@ -165,8 +196,12 @@ def test_both_scripts_read_an_observing_checkpoint_alike(observing):
     assert check_export(critic, V) < 1e-12 and critic.mismatch_scale and len(critic.plant.X_LOW) == 4
     x, rng = envs.sample_states(cstr, np.random.default_rng(0), 20), np.random.default_rng(1)
     m = rng.uniform(-1, 1, size=x.shape)
-    np.testing.assert_allclose(np.array(mu(x.T, [0.65], m.T)).T, policy.act(np.hstack([x, m]), [0.65]), rtol=1e-4, atol=1e-2)
-    np.testing.assert_allclose(np.array(V(x.T, [0.65], m.T))[0], policy.value(np.hstack([x, m]), [0.65]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        np.array(mu(x.T, [0.65], m.T)).T, policy.act(np.hstack([x, m]), [0.65]), rtol=1e-4, atol=1e-2
+    )
+    np.testing.assert_allclose(
+        np.array(V(x.T, [0.65], m.T))[0], policy.value(np.hstack([x, m]), [0.65]), rtol=1e-4, atol=1e-4
+    )
     assert not np.allclose(policy.act(np.hstack([x, 0 * m]), [0.65]), policy.act(np.hstack([x, m]), [0.65]))
 
 
@@ -204,7 +239,9 @@ def test_the_disturbance_makes_the_nominal_model_right_and_the_gain_filters_it()
     for estimator in estimators:
         estimator.before = x, u
         estimator.update(x_next)
-    np.testing.assert_allclose(cstr.step(x, u, cstr.PSI_NOMINAL) + estimators[0].disturbance, x_next, rtol=1e-12)
+    np.testing.assert_allclose(
+        cstr.step(x, u, cstr.PSI_NOMINAL) + estimators[0].disturbance, x_next, rtol=1e-12
+    )
     np.testing.assert_allclose(estimators[1].disturbance, estimators[0].disturbance / 4)
     np.testing.assert_allclose(estimators[1].mismatch, estimators[0].mismatch / 4)
 
@@ -223,12 +260,20 @@ def test_a_wrong_measurement_teaches_nothing(kind):
     np.testing.assert_array_equal(known[1:], [known[1]] * 3)
 
 
-@pytest.mark.parametrize("name, estimate", [("nominal_mpc", "parameters"), ("nominal_mpc", "disturbance"), ("rl_mpc", "disturbance")])
+@pytest.mark.parametrize(
+    "name, estimate",
+    [("nominal_mpc", "parameters"), ("nominal_mpc", "disturbance"), ("rl_mpc", "disturbance")],
+)
 def test_no_offset_remains(name, estimate):
     """Near the goal, on a plant that the nominal model misses."""
     offsets = []
     for offset_free in (False, True):
-        args = deploy.Args(horizon=5, compile=False, offset_free=offset_free, estimate=estimate if offset_free else "disturbance")
+        args = deploy.Args(
+            horizon=5,
+            compile=False,
+            offset_free=offset_free,
+            estimate=estimate if offset_free else "disturbance",
+        )
         x, _, _ = closed_loop(deploy.build_controller(name, args), (1.04, 0.93), 40)
         offsets.append(abs(x[-5:, 1] / cstr.EVAL_GOAL[0] - 1).mean())
     assert offsets[1] < (0.001 if name == "nominal_mpc" else 0.004) < 0.005 < offsets[0]
@@ -239,25 +284,50 @@ def test_no_offset_remains(name, estimate):
 
 def test_command_lines(observing, tmp_path):
     keep = dict(critic=observing, episodes=1, steps=3, jobs=1, compile=False, out=tmp_path)
-    for controllers, given in ((("actor", "goal_mpc", "rl_mpc"), dict(horizon=1, offset_free=True)), (("rl_mpc",), dict(horizon=0))):
+    for controllers, given in (
+        (("actor", "goal_mpc", "rl_mpc"), dict(horizon=1, offset_free=True)),
+        (("rl_mpc",), dict(horizon=0)),
+    ):
         deploy.main(deploy.Args(controllers=controllers, **given, **keep))
         rows = list(csv.DictReader(open(tmp_path / "results.csv")))
         assert tuple(row["controller"] for row in rows) == controllers and rows[0]["fell_back"] == "0"
-        assert json.loads(rows[0]["arguments"]) == {"steps": 3} | ({"offset_free": True} if "offset_free" in given else {})
+        assert json.loads(rows[0]["arguments"]) == {"steps": 3} | (
+            {"offset_free": True} if "offset_free" in given else {}
+        )
 
 
 @pytest.mark.parametrize(
     "script, arguments, words",
     [
-        ("sac_her_branching.py", ["--observe-mismatch", "--branches", "2"], ["--branches", "--observe-mismatch"]),
+        (
+            "sac_her_branching.py",
+            ["--observe-mismatch", "--branches", "2"],
+            ["--branches", "--observe-mismatch"],
+        ),
         ("sac_her_branching.py", ["--observe-mismatch", "--env", "linear"], ["--observe-mismatch", "Linear"]),
-        ("sac_her_branching.py", ["--scenario-hold", "episode", "--branches", "2"], ["--branches", "--scenario-hold"]),
-        ("sac_her_branching.py", ["--observe-mismatch", "--add-plant-data", "x.npz"], ["--add-plant-data", "--observe-mismatch"]),
+        (
+            "sac_her_branching.py",
+            ["--scenario-hold", "episode", "--branches", "2"],
+            ["--branches", "--scenario-hold"],
+        ),
+        (
+            "sac_her_branching.py",
+            ["--observe-mismatch", "--add-plant-data", "x.npz"],
+            ["--add-plant-data", "--observe-mismatch"],
+        ),
         ("rl_mpc_deploy.py", ["--offset-free", "--filter-gain", "0"], ["--filter-gain", "0.0"]),
         ("rl_mpc_deploy.py", ["--estimate", "parameters"], ["--estimate", "no effect", "--offset-free"]),
         ("rl_mpc_deploy.py", ["--filter-gain", "0.5"], ["--filter-gain", "no effect", "--offset-free"]),
-        ("rl_mpc_deploy.py", ["--constraints", "hard", "--slack-weight", "3"], ["--slack-weight", "no effect", "hard"]),
-        ("rl_mpc_deploy.py", ["--env", "linear", "--offset-free", "--estimate", "parameters"], ["--estimate", "uncertain"]),
+        (
+            "rl_mpc_deploy.py",
+            ["--constraints", "hard", "--slack-weight", "3"],
+            ["--slack-weight", "no effect", "hard"],
+        ),
+        (
+            "rl_mpc_deploy.py",
+            ["--env", "linear", "--offset-free", "--estimate", "parameters"],
+            ["--estimate", "uncertain"],
+        ),
     ],
 )
 def test_bad_arguments_get_one_sentence(script, arguments, words, capsys):

@@ -11,7 +11,10 @@ from envs import cstr
 from experiments.literal import LiteralMPC
 
 FIXTURES = Path(__file__).parent / "fixtures"
-SOLUTIONS = {(s["mode"], s["n_horizon"]): s for s in json.loads((FIXTURES / "do_mpc_solutions.json").read_text())["solutions"]}
+SOLUTIONS = {
+    (s["mode"], s["n_horizon"]): s
+    for s in json.loads((FIXTURES / "do_mpc_solutions.json").read_text())["solutions"]
+}
 U_RANGE = cstr.U_HIGH - cstr.U_LOW
 
 
@@ -28,7 +31,9 @@ class Collocated(LiteralMPC):
         points = ca.horzcat(x, z * ca.repmat(scale, 1, 2))
         slopes = ca.horzcat(*[cstr.ode(points[:, j + 1], u, psi, ca) for j in range(2)])
         residual = (points @ C - self.plant.DT * slopes) / ca.repmat(scale, 1, 2)
-        solver = ca.rootfinder("collocation", "newton", {"x": ca.vec(z), "p": ca.vertcat(x, u, psi), "g": ca.vec(residual)})
+        solver = ca.rootfinder(
+            "collocation", "newton", {"x": ca.vec(z), "p": ca.vertcat(x, u, psi), "g": ca.vec(residual)}
+        )
         root = ca.reshape(solver(ca.repmat(x / scale, 2, 1), ca.vertcat(x, u, psi)), 4, 2)
         physical = ca.Function("physical", [x, u, psi], [ca.horzcat(x, root * ca.repmat(scale, 1, 2)) @ D])
         after = physical(x * scale + center, u * self.u_scale + self.u_center, psi)
@@ -64,19 +69,37 @@ def solve(mode, horizon):
         options = dict(slack_price=[[0, 0, 0, 0], [1, 1, 1, 1]])
     else:
         stage = terminal = ca.Function("stage", [x, g], [(x[1] - g) ** 2])
-        options = dict(slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"])
-    mpc = Collocated(cstr, horizon, cstr.SCENARIOS["mpc"], stage, terminal, goal=[given["goal"]], robust_horizon=int(S > 1),
-              ipopt={"tol": 1e-8}, compile=False, **options)  # fmt: skip
+        options = dict(
+            slack_price=cstr.BENCHMARK["slack_price"], change_weight=cstr.BENCHMARK["change_weight"]
+        )
+    mpc = Collocated(
+        cstr,
+        horizon,
+        cstr.SCENARIOS["mpc"],
+        stage,
+        terminal,
+        goal=[given["goal"]],
+        robust_horizon=int(S > 1),
+        ipopt={"tol": 1e-8},
+        compile=False,
+        **options,
+    )
     x0 = np.array(given["x0"])
     u = mpc.make_step(x0)
     assert mpc.stats["rung"] == "solved", mpc.stats
     return mpc, mpc.objective, u
 
 
-@pytest.mark.parametrize("mode, horizon", [("nominal", 20), ("baseline", 20), ("nstep_vfmpc", 1), ("nstep_vfmpc", 2), ("nstep_vfmpc", 5)])
+@pytest.mark.parametrize(
+    "mode, horizon",
+    [("nominal", 20), ("baseline", 20), ("nstep_vfmpc", 1), ("nstep_vfmpc", 2), ("nstep_vfmpc", 5)],
+)
 def test_literal_variant_agrees_with_the_authors_stack(mode, horizon):
     mpc, objective, u = solve(mode, horizon)
     # IPOPT widened the reference's slack bounds by 1e-8 each: a bonus of price x slacks x 1e-8 that this solver does not take
     slacks = mpc.horizon * mpc.slack_price[np.isfinite(mpc.slack_price)].sum()
     assert objective == pytest.approx(SOLUTIONS[mode, horizon]["objective"] + 1e-8 * slacks, rel=2e-4)
-    assert np.all(np.abs(u - SOLUTIONS[mode, horizon]["u0"]) <= 0.01 * U_RANGE), (u, SOLUTIONS[mode, horizon]["u0"])
+    assert np.all(np.abs(u - SOLUTIONS[mode, horizon]["u0"]) <= 0.01 * U_RANGE), (
+        u,
+        SOLUTIONS[mode, horizon]["u0"],
+    )

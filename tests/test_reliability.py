@@ -22,9 +22,13 @@ sys.path.insert(0, str(ROOT / "experiments"))
 import reliability  # noqa: E402
 
 SCRIPTS = [goal_mpc, rl_mpc_deploy, sac_her_branching]
-NUMBERS = st.one_of(st.integers(-3, 300).map(str), st.integers(-(10**30), 10**30).map(str), st.floats().map(str))
+NUMBERS = st.one_of(
+    st.integers(-3, 300).map(str), st.integers(-(10**30), 10**30).map(str), st.floats().map(str)
+)
 TEXT = st.one_of(
-    st.text(string.printable, max_size=12), st.text(max_size=6), st.sampled_from(["", "cstr", "linear", "double_pendulum", "0"])
+    st.text(string.printable, max_size=12),
+    st.text(max_size=6),
+    st.sampled_from(["", "cstr", "linear", "double_pendulum", "0"]),
 )
 
 
@@ -32,14 +36,23 @@ def arguments(module):
     """Command lines of one to four of a script's arguments, whose values are often valid and often not."""
 
     def values(hint):
-        choices = [choice for part in (hint, *typing.get_args(hint)) for choice in typing.get_args(part) if isinstance(choice, str)]
+        choices = [
+            choice
+            for part in (hint, *typing.get_args(hint))
+            for choice in typing.get_args(part)
+            if isinstance(choice, str)
+        ]
         return st.one_of(*([st.sampled_from(choices)] * 3 if choices else []), NUMBERS, TEXT)
 
     def option(field):
         name, hint = "--" + field.name.replace("_", "-"), hints[field.name]
         if hint is bool:
             return st.sampled_from([[name], ["--no-" + name[2:]], [name, "1"]])
-        many = st.lists(values(hint), max_size=3) if typing.get_origin(hint) is tuple else st.lists(values(hint), min_size=1, max_size=1)
+        many = (
+            st.lists(values(hint), max_size=3)
+            if typing.get_origin(hint) is tuple
+            else st.lists(values(hint), min_size=1, max_size=1)
+        )
         return many.map(lambda words: [name, *words])
 
     hints = typing.get_type_hints(module.Args)
@@ -69,17 +82,32 @@ def test_any_file_is_a_checkpoint_or_refused_in_one_sentence(data, checkpoint, t
     path = tmp_path_factory.getbasetemp() / "fuzzed.pt"
     if data.draw(st.booleans()):
         content = bytearray(checkpoint.read_bytes())
-        for at, value in data.draw(st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=8)):
+        for at, value in data.draw(
+            st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=8)
+        ):
             content[at] = value
         path.write_bytes(content[: data.draw(st.one_of(st.just(None), st.integers(0, len(content))))])
     else:
         plain = st.recursive(
-            st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just(torch.zeros(2, 2))),
-            lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
+            st.one_of(
+                st.none(),
+                st.booleans(),
+                st.integers(),
+                st.floats(),
+                st.text(max_size=5),
+                st.just(torch.zeros(2, 2)),
+            ),
+            lambda inner: st.one_of(
+                st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=3)
+            ),
             max_leaves=6,
         )
         content = torch.load(checkpoint, weights_only=True)
-        where = data.draw(st.sampled_from([content, content["network"], content["scaling"], content["actor"], content["critic"]]))
+        where = data.draw(
+            st.sampled_from(
+                [content, content["network"], content["scaling"], content["actor"], content["critic"]]
+            )
+        )
         where[data.draw(st.sampled_from(sorted(where)))] = data.draw(plain)
         torch.save(content, path)
     for load in reliability.LOADERS:
@@ -102,7 +130,9 @@ def test_nothing_goes_wrong(study, quick):
     for folder in (quick, ROOT / "experiments"):
         for row in csv.DictReader(open(folder / f"results/reliability_{study}.csv")):
             if study == "controllers":
-                assert row["wrong"] == "0" and row["refused"] == (row["faults"] if row["case"] == "measurement not finite" else "0"), row
+                assert row["wrong"] == "0" and row["refused"] == (
+                    row["faults"] if row["case"] == "measurement not finite" else "0"
+                ), row
                 assert int(row["recovered"]) >= 0.95 * int(row["chances"]), row
             else:
                 assert row["held"] == row["trials"], row

@@ -55,7 +55,9 @@ def test_every_table_and_figure_has_a_step():
         for study in studies:
             plain, named = f"experiments/{path.name}", f"experiments/{path.name} --study {study}"
             assert named in commands or (study in (None, studies[0]) and plain in commands), named
-    trained = {step.name.removeprefix("critic_") for step in reproduce.STEPS if step.name.startswith("critic_")}
+    trained = {
+        step.name.removeprefix("critic_") for step in reproduce.STEPS if step.name.startswith("critic_")
+    }
     assert trained == {path.stem for path in (ROOT / "experiments/pretrained").glob("*.pt")}
 
 
@@ -94,7 +96,9 @@ def test_a_lost_worker_loses_no_result_and_doubles_none(settings):
         os.kill(victim, signal.SIGKILL)
         thread.join(timeout=60)
         assert not thread.is_alive()
-    assert {path.stem: path.read_text() for path in settings.out.glob("*.csv")} == {name: name for name in names}
+    assert {path.stem: path.read_text() for path in settings.out.glob("*.csv")} == {
+        name: name for name in names
+    }
     assert len(list((settings.runs / "done").iterdir())) == len(names) and len(started(settings)) > len(names)
 
 

@@ -16,18 +16,26 @@ from envs.runs.comparison import draws, run_episode
 
 CRITIC = Path(__file__).parent.parent / "experiments/pretrained/cstr_constrained.pt"
 SCENARIOS, GOAL, HORIZON = cstr.SCENARIOS["mpc"], cstr.EVAL_GOAL, 5
-pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="interpreted it takes minutes")
+pytestmark = pytest.mark.skipif(
+    not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="interpreted it takes minutes"
+)
 MIDDLE = (cstr.U_LOW + cstr.U_HIGH) / 2
 
 
 def gaussian():
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
-    return ca.Function("stage", [x, g], [-ca.exp(-ca.sumsqr(cstr.goal_error(x[cstr.GOAL_INDEX], g, ca)) / (2 * cstr.MPC_SIGMA2))])
+    return ca.Function(
+        "stage",
+        [x, g],
+        [-ca.exp(-ca.sumsqr(cstr.goal_error(x[cstr.GOAL_INDEX], g, ca)) / (2 * cstr.MPC_SIGMA2))],
+    )
 
 
 def quadratic():
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
-    return ca.Function("stage", [x, g], [ca.sumsqr(cstr.goal_error(x[cstr.GOAL_INDEX], g, ca)) / cstr.MPC_SIGMA2])
+    return ca.Function(
+        "stage", [x, g], [ca.sumsqr(cstr.goal_error(x[cstr.GOAL_INDEX], g, ca)) / cstr.MPC_SIGMA2]
+    )
 
 
 class FromGuess(goal_mpc.ScenarioMPC):
@@ -49,7 +57,11 @@ class Given(deploy.ScenarioMPC):
     given = None
 
     def _guesses(self, x):
-        return super()._guesses(x) if self.given is None else {"given": (self.given - self.u_center) / self.u_scale}
+        return (
+            super()._guesses(x)
+            if self.given is None
+            else {"given": (self.given - self.u_center) / self.u_scale}
+        )
 
     def improve(self, u, cost, tick):
         self.started = u.copy()
@@ -124,7 +136,9 @@ def test_a_plan_of_ipopt_costs_what_ipopt_says():
     for x in states(20):
         guess, _ = planned(sqp, x, 0)
         found = by_ipopt(ipopt, x, guess)
-        assert planned(sqp, x, 0, given=found)[1] == pytest.approx(ipopt.objective, abs=1e-4 * (1 + abs(ipopt.objective)))
+        assert planned(sqp, x, 0, given=found)[1] == pytest.approx(
+            ipopt.objective, abs=1e-4 * (1 + abs(ipopt.objective))
+        )
 
 
 def test_the_sqp_comes_back_to_the_optimum_of_ipopt():
@@ -134,7 +148,9 @@ def test_the_sqp_comes_back_to_the_optimum_of_ipopt():
     for x in states(60):
         guess, _ = planned(sqp, x, 0)
         best = by_ipopt(ipopt, x, guess)
-        moved = np.clip(best + 0.1 * sqp.u_scale * rng.uniform(-1, 1, size=best.shape), cstr.U_LOW, cstr.U_HIGH)
+        moved = np.clip(
+            best + 0.1 * sqp.u_scale * rng.uniform(-1, 1, size=best.shape), cstr.U_LOW, cstr.U_HIGH
+        )
         costs.append([planned(sqp, x, k, given=u)[1] for k, u in ((50, moved), (0, moved), (0, best))])
     costs = np.array(costs)
     assert (costs[:, 1] - costs[:, 2] > 1e-4 * (1 + np.abs(costs[:, 2]))).mean() > 0.5  # it had to improve

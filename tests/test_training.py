@@ -21,7 +21,12 @@ ROOT = Path(__file__).parent.parent
 
 def run_script(*arguments, **kwargs):
     return subprocess.run(
-        [sys.executable, "sac_her_branching.py", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=300, **kwargs
+        [sys.executable, "sac_her_branching.py", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        **kwargs,
     )
 
 
@@ -30,12 +35,20 @@ def run_script(*arguments, **kwargs):
 
 def filled_buffer(strategy, ratio, rows, steps, branches=1, num_envs=3, episode=7):
     """A buffer whose states count time: x = [env, t, t, t], reached x_next = [env, t + 0.5, ...]; env 1 has shorter episodes."""
-    args = training.Args(buffer_size=rows * num_envs, num_envs=num_envs, branches=branches, her_strategy=strategy, her_ratio=ratio)
+    args = training.Args(
+        buffer_size=rows * num_envs,
+        num_envs=num_envs,
+        branches=branches,
+        her_strategy=strategy,
+        her_ratio=ratio,
+    )
     buffer = training.HERBuffer(args, envs.load("cstr"))
     episodes = {env: [0] for env in range(num_envs)}  # start times
     for t in range(steps):
         x = np.array([[env, t, t, t] for env in range(num_envs)], dtype=float)
-        done = np.array([(t - episodes[env][-1] + 1) == (episode if env != 1 else 4) for env in range(num_envs)])
+        done = np.array(
+            [(t - episodes[env][-1] + 1) == (episode if env != 1 else 4) for env in range(num_envs)]
+        )
         branch = None if branches == 1 else x[:, None] + np.arange(1, branches + 1)[None, :, None] / 100
         buffer.add(x, np.full((num_envs, 2), t), np.full((num_envs, 1), -1.0 - t), x + 0.5, branch, done)
         for env in np.flatnonzero(done):
@@ -52,9 +65,13 @@ def test_hindsight_goals_are_those_of_a_naive_loop(strategy, rows, steps):
     seen = {}
     for env, t, g in zip(x[:, 0].long().tolist(), x[:, 1].long().tolist(), goal[:, 0].tolist()):
         seen.setdefault((env, t), set()).add(g)
-    assert set(seen) == {(env, t) for env in range(3) for t in range(oldest, steps)}  # every stored transition, no other
+    assert set(seen) == {
+        (env, t) for env in range(3) for t in range(oldest, steps)
+    }  # every stored transition, no other
     for (env, t), goals in seen.items():
-        end = min([s for s in episodes[env] if s > t] + [steps]) - 1  # last time of the episode, or what is written of it
+        end = (
+            min([s for s in episodes[env] if s > t] + [steps]) - 1
+        )  # last time of the episode, or what is written of it
         times = {"future": range(t, end + 1), "final": [end]}[strategy]
         assert goals == {s + 0.5 for s in times}, (env, t)
     assert torch.equal(u[:, 0], x[:, 1]) and torch.equal(x_next[:, 0], x + 0.5)
@@ -101,7 +118,9 @@ def test_branched_target_is_the_mean_of_single_targets(plant, entropy_in_target,
             outside = x_next[b, i].numpy() - np.clip(x_next[b, i].numpy(), plant.X_LOW, plant.X_HIGH)
             reward += constraint_weight * (np.exp(-np.sum(outside**2) / (2 * 0.01)) - 1)
             q = min(agent.target(z[[j]], actions[[j]])[:, 0].tolist())
-            total += reward + args.gamma * (q - entropy_in_target * agent.log_alpha.exp().item() * log_probs[j].item())
+            total += reward + args.gamma * (
+                q - entropy_in_target * agent.log_alpha.exp().item() * log_probs[j].item()
+            )
         assert y[b].item() == pytest.approx(total / 3, rel=1e-3)
 
 
@@ -217,10 +236,14 @@ def test_an_interrupted_and_resumed_run_equals_an_uninterrupted_one(tmp_path, mo
 
 
 def test_whatever_comes_in_is_saved_as_plain_data(tmp_path):
-    numbers = dict(learning_rate=np.float64(1e-3), gamma=np.float32(0.5), hidden=[np.int64(8), 8], seed=np.int64(1))
+    numbers = dict(
+        learning_rate=np.float64(1e-3), gamma=np.float32(0.5), hidden=[np.int64(8), 8], seed=np.int64(1)
+    )
     run = training.main(small(str(tmp_path), total_timesteps=320, learning_starts=160, **numbers))
     data = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert data["args"]["learning_rate"] == 1e-3 and data["gamma"] == 0.5 and data["network"]["hidden"] == [8, 8]
+    assert (
+        data["args"]["learning_rate"] == 1e-3 and data["gamma"] == 0.5 and data["network"]["hidden"] == [8, 8]
+    )
     assert training.load_policy(run / "checkpoint.pt").act(envs.load("cstr").START, 0.65).shape == (1, 2)
     assert training.main(training.Args(resume=run / "resume.pt")) == run
 
@@ -249,15 +272,44 @@ def test_it_learns(tmp_path):
 
 
 def test_command_line_end_to_end(tmp_path):
-    out = run_script("--env", "cstr", "--total-timesteps", 3200, "--learning-starts", 500, "--eval-every", 1600, "--eval-episodes", 20,
-                     "--scenarios", "mpc", "--branches", 2, "--no-smooth-reward", "--goal-input", "goal", "--her-strategy", "final",
-                     "--no-entropy-in-target", "--constraint-weight", 1,
-                     "--hidden", 32, 16, "--save-every", 1600, "--out", tmp_path)  # fmt: skip
+    out = run_script(
+        "--env",
+        "cstr",
+        "--total-timesteps",
+        3200,
+        "--learning-starts",
+        500,
+        "--eval-every",
+        1600,
+        "--eval-episodes",
+        20,
+        "--scenarios",
+        "mpc",
+        "--branches",
+        2,
+        "--no-smooth-reward",
+        "--goal-input",
+        "goal",
+        "--her-strategy",
+        "final",
+        "--no-entropy-in-target",
+        "--constraint-weight",
+        1,
+        "--hidden",
+        32,
+        16,
+        "--save-every",
+        1600,
+        "--out",
+        tmp_path,
+    )
     assert out.returncode == 0, out.stderr
     assert "robust evaluation" in out.stdout
     (run,) = tmp_path.iterdir()
     assert run.name.startswith("cstr__sac_her_branching__0__")
-    assert {"checkpoint.pt", "resume.pt", "evaluations.csv"} <= {p.name for p in run.iterdir()} and list(run.glob("events*"))
+    assert {"checkpoint.pt", "resume.pt", "evaluations.csv"} <= {p.name for p in run.iterdir()} and list(
+        run.glob("events*")
+    )
     rows = list(csv.DictReader(open(run / "evaluations.csv")))
     assert [int(row["step"]) for row in rows] == [1600, 3200]
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
@@ -270,8 +322,15 @@ def test_command_line_end_to_end(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run)).Reload()
-    assert {"losses/qf_loss", "losses/actor_loss", "losses/alpha", "charts/SPS", "charts/episodic_return",
-            "eval/robust_median_ape", "eval/nominal_median_ape"} <= set(events.Tags()["scalars"])  # fmt: skip
+    assert {
+        "losses/qf_loss",
+        "losses/actor_loss",
+        "losses/alpha",
+        "charts/SPS",
+        "charts/episodic_return",
+        "eval/robust_median_ape",
+        "eval/nominal_median_ape",
+    } <= set(events.Tags()["scalars"])
 
 
 def test_episodes_of_a_plant_enter_the_buffer_as_if_stepped(plant):
@@ -307,7 +366,11 @@ def test_plant_data_from_the_command_line(tmp_path):
     out = run_script("--resume", resume)  # finished: evaluates nothing anew, and does not add the data twice
     assert torch.load(resume, weights_only=True)["buffer"]["now"] == 3 + 320 // 8
     np.savez(tmp_path / "bad.npz", rl_mpc_x=x[:, :2], rl_mpc_u=u)
-    for path, words in ((tmp_path / "bad.npz", "not a trajectories.npz"), (tmp_path / "no.npz", "does not exist"), ("README.md", "not a")):
+    for path, words in (
+        (tmp_path / "bad.npz", "not a trajectories.npz"),
+        (tmp_path / "no.npz", "does not exist"),
+        ("README.md", "not a"),
+    ):
         out = run_script("--add-plant-data", path, "--out", tmp_path / "none")
         assert out.returncode == 2 and "Traceback" not in out.stderr and words in out.stderr
     assert not (tmp_path / "none").exists()

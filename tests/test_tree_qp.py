@@ -15,10 +15,14 @@ from envs import cstr
 from envs.control.tree_qp import ConicQP, ScenarioTree, TreeQP
 from envs.runs.comparison import draws, run_episode
 
-pytestmark = pytest.mark.skipif(not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="HPIPM's solver is compiled")
+pytestmark = pytest.mark.skipif(
+    not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="HPIPM's solver is compiled"
+)
 TIGHT = {"piqp": {"eps_abs": 1e-10, "eps_rel": 1e-12}}
 TOLERANCE = 1e-6  # of a cost, relative to 1 + |cost|
-LOOSE = {"violated": 1e-5}  # bounds that are a hundred out of reach: HPIPM's mode SPEED_ABS does not look at stationarity
+LOOSE = {
+    "violated": 1e-5
+}  # bounds that are a hundred out of reach: HPIPM's mode SPEED_ABS does not look at stationarity
 UNSOLVED = 4  # of about a hundred
 EACH = 14  # random problems per shape and kind
 
@@ -36,8 +40,18 @@ SHAPES = {
     "no bounds, changes": (2, 2, 2, 3, 1, True, 0.0),
 }
 KINDS = (
-    "plain", "flat", "singular", "indefinite", "inactive", "violated", "crossing", "tiny boxes", "at a limit", "dear", "cheap",
-)  # fmt: skip
+    "plain",
+    "flat",
+    "singular",
+    "indefinite",
+    "inactive",
+    "violated",
+    "crossing",
+    "tiny boxes",
+    "at a limit",
+    "dear",
+    "cheap",
+)
 
 
 def random_problem(rng, kind, tree, active, n_x, n_u):
@@ -74,8 +88,24 @@ def random_problem(rng, kind, tree, active, n_x, n_u):
         price = np.full_like(price, 4.5e4)
     elif kind == "cheap":
         price = np.full_like(price, 1e-3)
-    x_low, x_high = np.where(there[0], x_low, -1e9), np.where(there[1], x_high, 1e9)  # as the controller writes what is not there
-    return A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, max(price.max(initial=0), 1.0)
+    x_low, x_high = (
+        np.where(there[0], x_low, -1e9),
+        np.where(there[1], x_high, 1e9),
+    )  # as the controller writes what is not there
+    return (
+        A,
+        B,
+        slope,
+        hessian,
+        u_low,
+        u_high,
+        x_low,
+        x_high,
+        price,
+        change,
+        moved,
+        max(price.max(initial=0), 1.0),
+    )
 
 
 def cost_by_numpy(tree, active, problem, du):
@@ -148,7 +178,13 @@ def random_problems(shape, kind, number, seed=0):
 
 def measured(shape, kind, number=EACH, plugins=("piqp",), seed=0):
     tree, active, solver, oracle = shaped(shape)
-    return compared(tree, active, solver, [oracle(plugin) for plugin in plugins], random_problems(shape, kind, number, seed))
+    return compared(
+        tree,
+        active,
+        solver,
+        [oracle(plugin) for plugin in plugins],
+        random_problems(shape, kind, number, seed),
+    )
 
 
 ONE_SIDED = ("branching twice, changes", "some bounds")
@@ -164,15 +200,21 @@ def test_the_shapes_have_the_bounds_that_they_are_for():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_problems_against_piqp(kind):
-    check(np.concatenate([measured(shape, kind) for shape in BOTH_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE))
+    check(
+        np.concatenate([measured(shape, kind) for shape in BOTH_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE)
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_problems_with_one_sided_bounds_against_piqp(kind):
-    check(np.concatenate([measured(shape, kind) for shape in ONE_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE))
+    check(
+        np.concatenate([measured(shape, kind) for shape in ONE_SIDED]), tolerance=LOOSE.get(kind, TOLERANCE)
+    )
 
 
-@pytest.mark.parametrize("plugin, shapes", [("highs", BOTH_SIDED), ("qpoases", ["branching once, changes", "one stage"])])
+@pytest.mark.parametrize(
+    "plugin, shapes", [("highs", BOTH_SIDED), ("qpoases", ["branching once, changes", "one stage"])]
+)
 def test_random_problems_against_other_solvers(plugin, shapes):
     """Where they find no solution PIQP's stands; what they return may not be lower."""
     found = [measured(shape, kind, 2, (plugin, "piqp"), seed=1) for shape in shapes for kind in KINDS]
@@ -201,13 +243,20 @@ def recorded(name, horizon, wanted):
     return problems[:wanted], (controller.tree, 4, 2, active, name == "robust_mpc"), controller.qp
 
 
-RECORDED = {"rl_mpc, N = 1": ("rl_mpc", 1, 300), "rl_mpc, N = 5": ("rl_mpc", 5, 300), "robust_mpc": ("robust_mpc", 1, 200)}
+RECORDED = {
+    "rl_mpc, N = 1": ("rl_mpc", 1, 300),
+    "rl_mpc, N = 5": ("rl_mpc", 5, 300),
+    "robust_mpc": ("robust_mpc", 1, 200),
+}
 
 
 def measured_recorded(name, number=None, plugins=("piqp",)):
     problems, sizes, solver = recorded(*RECORDED[name])
     oracles = [ConicQP(*sizes, plugin, TIGHT if plugin == "piqp" else None) for plugin in plugins]
-    problems = [(*(np.squeeze(p) if p.ndim == 0 else p for p in problem[:-1]), float(problem[-1])) for problem in problems]
+    problems = [
+        (*(np.squeeze(p) if p.ndim == 0 else p for p in problem[:-1]), float(problem[-1]))
+        for problem in problems
+    ]
     return compared(sizes[0], sizes[3], solver, oracles, problems[:number])
 
 
@@ -224,7 +273,9 @@ def test_problems_of_closed_loops_against_piqp(name):
 def positive_part(hessian):
     solver = shaped("no bounds")[2]
     h, result = np.ascontiguousarray(hessian, dtype=float), np.full(hessian.shape, np.nan)
-    solver.library.tree_qp_positive_part(len(h), ctypes.c_void_p(h.ctypes.data), ctypes.c_void_p(result.ctypes.data))
+    solver.library.tree_qp_positive_part(
+        len(h), ctypes.c_void_p(h.ctypes.data), ctypes.c_void_p(result.ctypes.data)
+    )
     return result
 
 
@@ -248,7 +299,9 @@ def test_the_positive_part_against_numpy(kind):
         for hessian in (symmetric(rng, n, kind), np.diag(np.diag(symmetric(rng, n, kind)))):
             values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
             expected = (vectors * np.maximum(values, 0)) @ vectors.T
-            assert np.abs(positive_part(hessian) - expected).max() <= 1e-12 * max(np.abs(values).max(), 1e-300)
+            assert np.abs(positive_part(hessian) - expected).max() <= 1e-12 * max(
+                np.abs(values).max(), 1e-300
+            )
 
 
 def test_the_positive_part_is_of_the_symmetric_part():

@@ -45,7 +45,9 @@ def read_file(path, wanted, what, most=None, build=lambda data: data):
         return build(data)
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist; it must be {what}") from None
-    except Exception as error:  # text, a folder, a pickle of code, weights that do not fit: torch raises many types
+    except (
+        Exception
+    ) as error:  # text, a folder, a pickle of code, weights that do not fit: torch raises many types
         reason = str(error) if type(error) is ValueError and "\n" not in str(error) else type(error).__name__
         raise ValueError(f"{path} is not {what} ({reason})") from None
 
@@ -59,13 +61,19 @@ def read_checkpoint(path, env, build):
             raise ValueError("of no plant")
         if data["goal_input"] not in ("error", "goal"):
             raise ValueError(f"unknown goal_input {data['goal_input']!r}")
-        if not all((np.asarray(v, dtype=float) > 0).all() for name, v in data["scaling"].items() if name.endswith("scale")):
+        if not all(
+            (np.asarray(v, dtype=float) > 0).all()
+            for name, v in data["scaling"].items()
+            if name.endswith("scale")
+        ):
             raise ValueError("scales that are not positive")
         if not all(v.isfinite().all() for network in ("actor", "critic") for v in data[network].values()):
             raise ValueError("weights that are not finite")
         return found, build(data) if env in (None, found) else None
 
-    found, agent = read_file(path, FORMAT, "a checkpoint.pt of sac_her_branching.py", most=MAX_CHECKPOINT_BYTES, build=checked)
+    found, agent = read_file(
+        path, FORMAT, "a checkpoint.pt of sac_her_branching.py", most=MAX_CHECKPOINT_BYTES, build=checked
+    )
     if env not in (None, found):
         raise ValueError(f"{path} was trained on {found!r}, not on {env!r}; --env and --critic must match")
     return agent

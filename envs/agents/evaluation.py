@@ -37,7 +37,10 @@ def evaluation_row(policy, episodes):
         row |= {f"{name}_median_ape": np.median(errors), f"{name}_p75_ape": np.quantile(errors, 0.75)}
         if name == "robust" and held_out.any():
             row["robust_held_out_median_ape"] = np.median(errors[held_out])
-        row |= {f"{name}_median_outside": np.median(outside), f"{name}_p75_outside": np.quantile(outside, 0.75)}
+        row |= {
+            f"{name}_median_outside": np.median(outside),
+            f"{name}_p75_outside": np.quantile(outside, 0.75),
+        }
     return {name: float(value) for name, value in row.items()}
 
 
@@ -46,5 +49,8 @@ def evaluation_table(row):
     lines = ["median [75th percentile] over starts      error, %      time outside constraints, %"]
     for name in ("robust", "nominal"):
         columns = [(row[f"{name}_median_{key}"], row[f"{name}_p75_{key}"]) for key in ("ape", "outside")]
-        lines.append(f"{name} evaluation".ljust(20) + "".join(f"{median:17.2f} [{p75:6.2f}]" for median, p75 in columns))
+        lines.append(
+            f"{name} evaluation".ljust(20)
+            + "".join(f"{median:17.2f} [{p75:6.2f}]" for median, p75 in columns)
+        )
     return "\n".join(lines)

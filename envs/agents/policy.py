@@ -19,7 +19,9 @@ class Scaling:
     @classmethod
     def of(cls, plant):
         def affine(name, low, high):
-            half = np.where(high > low, (high - low) / 2, 1.0)  # a mismatch starts at zero and has unit scale already
+            half = np.where(
+                high > low, (high - low) / 2, 1.0
+            )  # a mismatch starts at zero and has unit scale already
             return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": half.tolist()}
 
         index, n_x = plant.GOAL_INDEX, len(plant.INIT_LOW)
@@ -83,7 +85,9 @@ def read_policy(path, actor_class, critic_class):
         critic.load_state_dict(data["critic"], assign=True)
         networks = actor.float(), critic.float()
         policy = Policy(plant, *networks, Scaling(**data["scaling"]), data["goal_input"])
-        if not np.isfinite(policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)).all():
+        if not np.isfinite(
+            policy.value(envs.sample_states(plant, np.random.default_rng(0), 1), plant.EVAL_GOAL)
+        ).all():
             raise ValueError("values that are not finite")
         return policy
 

@@ -43,16 +43,24 @@ def compiled(source, *flags, link=("-lm",)):
         raise OSError("no gcc, clang or cc")
     version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
     info = Path("/proc/cpuinfo")
-    processor = re.search(r"^(flags|Features)\s*:.*", info.read_text(), re.MULTILINE) if info.exists() else None
+    processor = (
+        re.search(r"^(flags|Features)\s*:.*", info.read_text(), re.MULTILINE) if info.exists() else None
+    )
     processor = processor[0] if processor else platform.processor()
-    key = hashlib.sha256(source.encode() + version + f"{FLAGS} {flags} {link} {processor}".encode()).hexdigest()[:32]
+    key = hashlib.sha256(
+        source.encode() + version + f"{FLAGS} {flags} {link} {processor}".encode()
+    ).hexdigest()[:32]
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
     library = cache / f"{key}.so"
     if not library.exists():
         cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache) as folder:  # linked apart: fast-math, linked in, would change the whole process
+        with tempfile.TemporaryDirectory(
+            dir=cache
+        ) as folder:  # linked apart: fast-math, linked in, would change the whole process
             (Path(folder) / "source.c").write_text(source)
-            run = lambda *command: subprocess.run([compiler, *command], check=True, capture_output=True, cwd=folder)  # noqa: E731
+            run = lambda *command: subprocess.run(
+                [compiler, *command], check=True, capture_output=True, cwd=folder
+            )  # noqa: E731
             run(*FLAGS, *flags, "-c", "source.c")
             run("-shared", "source.o", "-o", "library.so", *link)
             os.replace(Path(folder) / "library.so", library)
@@ -69,7 +77,10 @@ def compiled_solver(plugin, nlp, options):
     Where the problem cannot be compiled, a notice is printed and None returned.
     """
     try:
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # CasADi writes into the current folder
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            contextlib.chdir(folder),
+        ):  # CasADi writes into the current folder
             ca.nlpsol("nlp", plugin, nlp, options("cold")).generate_dependencies("nlp.c")
             library = compiled(vectorised(Path("nlp.c").read_text()))
         return {name: ca.nlpsol(name, plugin, str(library), options(name)) for name in ("cold", "warm")}

@@ -25,11 +25,18 @@ def checked_problem(plant, scenarios, slack_price, change_weight):
     if scenarios.shape[1:] != (n_psi,) or not len(scenarios) or not np.isfinite(scenarios).all():
         raise ValueError(f"scenarios have shape {scenarios.shape}; they must be finite, (S, {n_psi})")
     prices = []
-    for name, price, shape, most in (("slack_price", slack_price, (2, n_x), np.inf), ("change_weight", change_weight, (n_u,), 1e300)):
+    for name, price, shape, most in (
+        ("slack_price", slack_price, (2, n_x), np.inf),
+        ("change_weight", change_weight, (n_u,), 1e300),
+    ):
         price = np.array(price, dtype=float)
-        if price.shape not in ((), shape[-1:], shape) or not ((price >= 0) & (price <= most)).all():  # nor is nan
+        if (
+            price.shape not in ((), shape[-1:], shape) or not ((price >= 0) & (price <= most)).all()
+        ):  # nor is nan
             finite = "finite and " * (most < np.inf)
-            raise ValueError(f"{name} is {price.tolist()}; it must be a number or {shape}, {finite}not negative")
+            raise ValueError(
+                f"{name} is {price.tolist()}; it must be a number or {shape}, {finite}not negative"
+            )
         prices.append(np.broadcast_to(price, shape).copy())
     return scenarios, *prices
 
@@ -52,7 +59,9 @@ class Controller:
         """Forget everything, as at the start of an episode; u: the action (n_u,) that the plant gets now, default 0."""
         u = np.zeros(len(self.plant.U_LOW)) if u is None else np.array(u, dtype=float).reshape(-1)
         if u.shape != self.plant.U_LOW.shape or not np.isfinite(u).all():
-            raise ValueError(f"u is {u}; it must be {len(self.plant.U_LOW)} finite number(s): {', '.join(self.plant.ACTION_NAMES)}")
+            raise ValueError(
+                f"u is {u}; it must be {len(self.plant.U_LOW)} finite number(s): {', '.join(self.plant.ACTION_NAMES)}"
+            )
         self.x_before, self.u_before = None, u
         self.stats = {}
         self.estimator.reset()
@@ -111,7 +120,12 @@ class GreedyController(ActorController):
     def __init__(self, plant, actor, Q, goal, estimator=None, points=9):
         super().__init__(plant, actor, goal, estimator)
         n_u = len(plant.U_LOW)
-        sizes = (("v", n_u), ("x", len(plant.X_LOW)), ("goal", len(self.goal)), ("mismatch", len(plant.X_LOW)))
+        sizes = (
+            ("v", n_u),
+            ("x", len(plant.X_LOW)),
+            ("goal", len(self.goal)),
+            ("mismatch", len(plant.X_LOW)),
+        )
         v, *given = (ca.MX.sym(*size) for size in sizes)  # v: action scaled to [0, 1]
         q = call(Q, given[0], plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), *given[1:])
         self.negative_q = ca.Function("negative_q", [v, *given], [-q, -ca.gradient(q, v)])

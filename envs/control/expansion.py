@@ -15,7 +15,9 @@ def expansion(critic):
     networks one by one. A critic that does not observe the mismatch ignores it.
     """
     s, actor, n_x = critic.scaling, critic.actor, len(critic.plant.X_LOW)
-    x, goal, mismatch = (ca.MX.sym(*size) for size in (("x", n_x), ("goal", s["goal_center"].size), ("mismatch", n_x)))
+    x, goal, mismatch = (
+        ca.MX.sym(*size) for size in (("x", n_x), ("goal", s["goal_center"].size), ("mismatch", n_x))
+    )
     z = critic.features(ca.vertcat(x, mismatch) if critic.mismatch_scale else x, goal)
     z_x = ca.densify(ca.jacobian(z, x))
 
@@ -103,5 +105,7 @@ def check_export(critic, V, points=64, tolerance=1e-8):
     errors = v[0] - value, (slope.T - gradient.numpy()) * x_scale  # slopes per unit of the network's input
     worst = max(np.abs(error).max() for error in errors) / (1 + np.abs(value).max())
     if not worst < tolerance:
-        raise RuntimeError(f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run")
+        raise RuntimeError(
+            f"the CasADi export differs from torch by {worst:.1e} (allowed: {tolerance:.0e}); nothing was run"
+        )
     return worst

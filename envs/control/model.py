@@ -7,8 +7,12 @@ import envs
 
 def scaling(plant):
     """Centre and half-width (1 where it has none) of the box of initial states, then of the actions: x = x_center + x_scale * scaled."""
-    return ((plant.INIT_LOW + plant.INIT_HIGH) / 2, envs.half_width(plant),
-            (plant.U_LOW + plant.U_HIGH) / 2, (plant.U_HIGH - plant.U_LOW) / 2)  # fmt: skip
+    return (
+        (plant.INIT_LOW + plant.INIT_HIGH) / 2,
+        envs.half_width(plant),
+        (plant.U_LOW + plant.U_HIGH) / 2,
+        (plant.U_HIGH - plant.U_LOW) / 2,
+    )
 
 
 def prediction_model(plant):
@@ -33,4 +37,6 @@ def prediction_model(plant):
         plain = substep(plain, u, psi)
         after, a, b = sensitive(after, u, psi)
         A, B = a @ A, a @ B + b
-    return ca.Function("step", [x, u, psi], [plain], named), ca.Function("step_jacobian", [x, u, psi], [after, A, B], named)
+    return ca.Function("step", [x, u, psi], [plain], named), ca.Function(
+        "step_jacobian", [x, u, psi], [after, A, B], named
+    )

@@ -29,16 +29,22 @@ class ScenarioTree:
     def __init__(self, scenarios, horizon, robust_horizon):
         whole = all(isinstance(number, (int, np.integer)) for number in (horizon, robust_horizon))
         if not whole or horizon < 1 or robust_horizon < 0:
-            raise ValueError(f"horizon is {horizon!r}, robust_horizon {robust_horizon!r}; they must be whole and at least 1 and 0")
+            raise ValueError(
+                f"horizon is {horizon!r}, robust_horizon {robust_horizon!r}; they must be whole and at least 1 and 0"
+            )
         leaves = scenarios ** min(robust_horizon, horizon)
         if leaves * horizon > MAX_NODES:
-            raise ValueError(f"a robust horizon of {robust_horizon} gives {leaves} leaves; leaves times horizon may be {MAX_NODES} at most")
+            raise ValueError(
+                f"a robust horizon of {robust_horizon} gives {leaves} leaves; leaves times horizon may be {MAX_NODES} at most"
+            )
         self.nodes = [scenarios ** min(t, robust_horizon) for t in range(horizon + 1)]
         self.first = np.cumsum([0, *self.nodes])
         self.inner = int(self.first[horizon])
         self.stage = np.repeat(np.arange(horizon + 1), self.nodes)
         self.parent, self.scenario = np.full(len(self.stage), -1), np.zeros(len(self.stage), dtype=int)
-        self.history = np.full((len(self.stage), max(robust_horizon, 1)), scenarios)  # at each branching; S where none yet
+        self.history = np.full(
+            (len(self.stage), max(robust_horizon, 1)), scenarios
+        )  # at each branching; S where none yet
         for node in range(1, len(self.stage)):
             t, order = self.stage[node], node - self.first[self.stage[node]]
             branching = t <= robust_horizon
@@ -54,7 +60,10 @@ class ScenarioTree:
     def by_stage(self, x, u):
         """Lists over stages: of x (nodes - 1, n_x), x_1 ... x_N as (n_x, nodes); of u (inner, n_u), u_0 ... u_{N-1} as (n_u, nodes)."""
         first = self.first[1:-1]
-        return {"x": [part.T for part in np.split(x, first[1:] - 1)], "u": [part.T for part in np.split(u, first[:-1])]}
+        return {
+            "x": [part.T for part in np.split(x, first[1:] - 1)],
+            "u": [part.T for part in np.split(u, first[:-1])],
+        }
 
     def weights(self, weight):
         """Weight of every node from those of the scenarios (S,); the weights of a stage sum to one."""
@@ -70,7 +79,9 @@ def tree_qp(tree, n_x, n_u, active, changes, compile=True):
         try:
             return TreeQP(tree, n_x, n_u, active, changes)
         except (OSError, subprocess.CalledProcessError) as error:
-            print(f"notice: the quadratic programs go to PIQP, several times slower ({error})", file=sys.stderr)
+            print(
+                f"notice: the quadratic programs go to PIQP, several times slower ({error})", file=sys.stderr
+            )
     return ConicQP(tree, n_x, n_u, active, changes)
 
 
@@ -88,7 +99,9 @@ class TreeQP:
 
     def __init__(self, tree, n_x, n_u, active, changes):
         search = [f"-L{WHEEL}", "-lhpipm", "-lblasfeo", "-lm", f"-Wl,-rpath,{WHEEL}"]
-        self.library = ctypes.CDLL(str(compiled(Path(__file__).with_suffix(".c").read_text(), f"-I{WHEEL / 'include'}", link=search)))
+        self.library = ctypes.CDLL(
+            str(compiled(Path(__file__).with_suffix(".c").read_text(), f"-I{WHEEL / 'include'}", link=search))
+        )
         self.library.tree_qp_new.restype = ctypes.c_void_p
         self.row = np.flatnonzero(active.any(axis=0)).astype(np.int32)
         parent, stage = (np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage))
@@ -102,7 +115,12 @@ class TreeQP:
         edges, rows, inner = len(parent) - 1, len(self.row), (tree.inner, n_u)
         shapes = [(edges, n_x * n_x), (edges, n_x * n_u), (edges, n_x), (edges, n_x * n_x), inner, inner]
         shapes += [(edges, rows), (edges, rows), (edges, 2, rows), inner, inner]
-        self.given, self.du, self.cost, self.counted = list(map(np.zeros, shapes)), np.zeros(inner), ctypes.c_double(), ctypes.c_int()
+        self.given, self.du, self.cost, self.counted = (
+            list(map(np.zeros, shapes)),
+            np.zeros(inner),
+            ctypes.c_double(),
+            ctypes.c_int(),
+        )
         self.memory = list(map(pointer, self.given))
         self.found = pointer(self.du), ctypes.byref(self.cost), ctypes.byref(self.counted)
 
@@ -114,7 +132,9 @@ class TreeQP:
         bounds = two_sided(self.active, x_low, x_high, price)
         for kept, value in zip(self.given, (A, B, slope, hessian, u_low, u_high, *bounds, change, moved)):
             kept[...] = np.reshape(value, kept.shape)
-        status = self.library.tree_qp_solve(self.instance, *self.memory, ctypes.c_double(barrier), *self.found)
+        status = self.library.tree_qp_solve(
+            self.instance, *self.memory, ctypes.c_double(barrier), *self.found
+        )
         solved = status == 0 and np.isfinite(self.du).all()
         return (self.du, self.cost.value) if solved else (None, np.nan)
 
@@ -141,23 +161,45 @@ class ConicQP:
         parent, inner = tree.parent, tree.inner
         edges, self.row, self.iterations = len(parent) - 1, np.flatnonzero(active.any(axis=0)), 0
         rows, price = len(self.row), (2 * np.flatnonzero(active.any(axis=0)).size, edges)
-        sizes = {"A": (n_x, n_x * edges), "B": (n_x, n_u * edges), "slope": (n_x, edges), "hessian": (n_x, n_x * edges), "price": price,
-                 "change": (n_u, inner), "moved": (n_u, inner)}  # fmt: skip
+        sizes = {
+            "A": (n_x, n_x * edges),
+            "B": (n_x, n_u * edges),
+            "slope": (n_x, edges),
+            "hessian": (n_x, n_x * edges),
+            "price": price,
+            "change": (n_u, inner),
+            "moved": (n_u, inner),
+        }
         p = {name: ca.MX.sym(name, *size) for name, size in sizes.items()}
-        dx, du, below, above = (ca.MX.sym(name, n, k) for name, n, k in
-                                (("dx", n_x, edges), ("du", n_u, inner), ("below", rows, edges), ("above", rows, edges)))  # fmt: skip
+        dx, du, below, above = (
+            ca.MX.sym(name, n, k)
+            for name, n, k in (
+                ("dx", n_x, edges),
+                ("du", n_u, inner),
+                ("below", rows, edges),
+                ("above", rows, edges),
+            )
+        )
         f, dynamics = ca.dot(p["price"], ca.vertcat(below, above)) + RIDGE / 2 * ca.sumsqr(du), []
         for e, before in enumerate(parent[1:]):
-            A, B, hessian = (p[name][:, e * k : (e + 1) * k] for name, k in (("A", n_x), ("B", n_u), ("hessian", n_x)))
+            A, B, hessian = (
+                p[name][:, e * k : (e + 1) * k] for name, k in (("A", n_x), ("B", n_u), ("hessian", n_x))
+            )
             f += ca.dot(p["slope"][:, e], dx[:, e]) + ca.bilin(hessian, dx[:, e], dx[:, e]) / 2
             dynamics.append(dx[:, e] - B @ du[:, int(before)] - (A @ dx[:, int(before) - 1] if before else 0))
         for i in range(inner):
             step = du[:, i] - (du[:, int(parent[i])] if i else 0)
             f += ca.dot(p["change"][:, i], step**2 + 2 * p["moved"][:, i] * step)
         bounded = dx[self.row.tolist(), :]
-        problem = {"x": ca.veccat(dx, du, below, above), "p": ca.veccat(*p.values()), "f": f,
-                   "g": ca.veccat(*dynamics, bounded + below, bounded - above)}  # fmt: skip
-        quiet = {"highs": {"highs": {"output_flag": False}}, "qpoases": {"printLevel": "none"}}.get(plugin, {})
+        problem = {
+            "x": ca.veccat(dx, du, below, above),
+            "p": ca.veccat(*p.values()),
+            "f": f,
+            "g": ca.veccat(*dynamics, bounded + below, bounded - above),
+        }
+        quiet = {"highs": {"highs": {"output_flag": False}}, "qpoases": {"printLevel": "none"}}.get(
+            plugin, {}
+        )
         self.solver = ca.qpsol("qp", plugin, problem, quiet | {"error_on_fail": False} | (options or {}))
         self.active = active[:, self.row]
         self.square = edges, n_x, n_x
@@ -167,7 +209,20 @@ class ConicQP:
         low, high, price = (np.ravel(a) for a in two_sided(self.active, x_low, x_high, price))
         none, slack = np.full(low.size, np.inf), np.zeros(2 * low.size)
         found = self.solver(
-            p=np.concatenate([np.ravel(a) for a in (A, B, slope, positive_part(np.reshape(hessian, self.square)), price, change, moved)]),
+            p=np.concatenate(
+                [
+                    np.ravel(a)
+                    for a in (
+                        A,
+                        B,
+                        slope,
+                        positive_part(np.reshape(hessian, self.square)),
+                        price,
+                        change,
+                        moved,
+                    )
+                ]
+            ),
             lbg=np.concatenate([self.zeros, low, -none]),
             ubg=np.concatenate([self.zeros, none, high]),
             lbx=np.concatenate([self.zeros - np.inf, np.ravel(u_low), slack]),

@@ -1,0 +1,244 @@
+"""What a plant module may look like, and what becomes of one that is wrong; copies, real clients, shapes."""
+
+import copy
+import importlib
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import envs
+import goal_mpc
+from envs import cstr
+
+ROOT = Path(__file__).parent.parent
+SMALLEST = """
+import numpy as np
+from envs.plant import stack
+ENV_ID, DT = "Test/{name}-v0", 0.1
+STATE_NAMES, STATE_UNITS = ("p", "v"), ("m", "m/s")
+X_LOW, X_HIGH = np.array([-2.0, -1.0]), np.array([2.0, 1.0])
+ACTION_NAMES, ACTION_UNITS, U_LOW, U_HIGH = ("a",), ("m/s^2",), np.array([-1.0]), np.array([1.0])
+GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL = [0], np.array([[0.5], [1.0]]), np.array([0.7])
+def ode(x, u, psi, xp=np):
+    return stack(xp, [x[1], u[0] - x[1] - x[0]])
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A second folder of plants: `folder(name, text, old, new)` writes one."""
+    monkeypatch.setattr(envs, "__path__", [*envs.__path__, str(tmp_path)])
+    envs._load.cache_clear()
+
+    def write(name, old="", new="", text=SMALLEST):
+        assert old in text
+        text = text.replace(old, new) if old else text
+        (tmp_path / f"{name}.py").write_text(text.replace("{name}", name))
+        sys.modules.pop(f"envs.{name}", None)
+        importlib.invalidate_caches()
+        return name
+
+    yield write
+    envs._load.cache_clear()
+
+
+def test_the_fewest_names_make_a_plant(folder):
+    """15 names, nothing uncertain: it simulates, trains, plans."""
+    plant = envs.load(folder("smallest"))
+    x = plant.step(np.array([0.0, 0.5]), np.array([0.2]), plant.PSI_NOMINAL)
+    assert x.shape == (2,) and plant.SCENARIOS["robust"].shape == plant.EVAL_PSI.shape == (1, 0)
+    env, vec = envs.GoalEnv("smallest"), envs.VectorGoalEnv("smallest", 3)
+    assert env.reset(seed=0)[0]["desired_goal"][0] in (0.5, 1.0) and vec.reset(seed=0)[0][
+        "observation"
+    ].shape == (3, 2)
+    for robust_horizon in (0, 1):  # psi has no entries
+        mpc = goal_mpc.build_controller(
+            goal_mpc.Args(env="smallest", horizon=15, robust_horizon=robust_horizon, compile=False)
+        )
+        for _ in range(80):
+            x = plant.step(x, mpc.make_step(x), plant.PSI_NOMINAL)
+        assert x[0] == pytest.approx(0.7, abs=0.02)
+
+
+def test_uncertain_parameters_make_the_scenario_sets(folder):
+    text = (
+        SMALLEST
+        + "PSI_NOMINAL, PSI_LOW, PSI_HIGH = np.ones(2), np.array([0.95, 0.9]), np.array([1.05, 1.1])\n"
+    )
+    plant = envs.load(folder("uncertain", text=text))
+    np.testing.assert_array_equal(plant.SCENARIOS["mpc"], cstr.SCENARIOS["mpc"])
+    np.testing.assert_allclose(plant.SCENARIOS["robust"], cstr.SCENARIOS["robust"])
+    assert plant.EVAL_PSI.shape == (49, 2) and plant.PSI_NAMES == ("psi_1", "psi_2")
+
+
+def test_a_state_that_always_starts_at_one_value(folder):
+    text = SMALLEST + "INIT_LOW, INIT_HIGH = np.array([-1.0, 0.0]), np.array([1.0, 0.0])\n"
+    plant = envs.load(folder("at_rest", text=text))
+    mpc = goal_mpc.build_controller(goal_mpc.Args(env="at_rest", horizon=10, compile=False))
+    mpc.make_step(plant.START)
+    assert mpc.stats["rung"] == "solved"
+
+
+WRONG = {
+    '"Test/{name}-v0", 0.1': ('"Test/{name}-v0", -0.1', "DT is -0.1"),
+    'ENV_ID, DT = "Test/{name}-v0", 0.1': ('ENV_ID = "Test/{name}-v0"', "lacks DT"),
+    "def ode": ("def equations", "lacks ode"),
+    "np.array([2.0, 1.0])": ("np.array([2.0, 1.0, 3.0])", "X_HIGH has shape"),
+    "X_HIGH = np.array([-2.0, -1.0]), np.array([2.0, 1.0])": (
+        "X_HIGH = np.array([-2.0, -np.inf]), np.array([2.0, np.inf])",
+        "INIT_LOW.*finite.*give INIT_LOW",
+    ),
+    '("m", "m/s")': ('("m",)', "STATE_UNITS are 1"),
+    "np.array([-1.0]), np.array([1.0])\nGOAL": (
+        "np.array([1.0]), np.array([1.0])\nGOAL",
+        "U_LOW is .* not in order",
+    ),
+    "GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL = [0]": ("GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL = [2]", "GOAL_INDEX"),
+    "np.array([0.7])": ("np.array([np.nan])", "EVAL_GOAL"),
+    "np.array([[0.5], [1.0]])": ("np.array([0.5, 1.0])", "TRAIN_GOALS has shape"),
+    "u[0] - x[1] - x[0]": ("u[1] - x[1]", "a step from START fails .IndexError"),
+    "[x[1], u[0] - x[1] - x[0]]": ("[x[1]]", "ode at START gives"),
+    "import numpy as np": ("import numpy as np, no_such_module", "cannot be imported .ModuleNotFoundError"),
+    "def ode(x, u, psi, xp=np):": ("def ode(x, u, psi, xp=np)", "cannot be imported .SyntaxError"),
+}
+
+
+@pytest.mark.parametrize("number", range(len(WRONG)))
+def test_a_plant_that_is_wrong_is_refused_by_name_and_harms_no_other(folder, number):
+    old, (new, words) = list(WRONG.items())[number]
+    name = folder(f"wrong_{number}", old, new, text=SMALLEST)
+    with pytest.raises(ValueError, match=words) as error:
+        envs.load(name)
+    assert f"envs/{name}.py" in str(error.value)
+    assert envs.load("cstr").name == "cstr" and name in envs.names()
+
+
+def test_other_files_are_no_plants_and_two_of_one_id_are_refused(folder):
+    folder("helper", text="VALUE = 1\n")
+    assert "helper" not in envs.names() and "plant" not in envs.names()
+    folder("cstr_old", text=Path(cstr.__file__).read_text())
+    for name in ("cstr", "cstr_old"):
+        with pytest.raises(ValueError, match="envs/cstr.py and envs/cstr_old.py have the same ENV_ID"):
+            envs.load(name)
+    assert envs.load("linear").name == "linear"
+
+
+def test_importing_envs_imports_no_plant_and_registers_all():
+    code = "import sys, envs, gymnasium as gym; assert not {'envs.cstr', 'envs.linear', 'casadi', 'torch'} & set(sys.modules); "
+    code += (
+        "print(gym.make('RLMPC/CSTR-v0').reset(seed=0)[0]['observation'].shape, 'envs.linear' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert out.stdout.split("\n")[0] == "(4,) False", out.stderr
+
+
+@pytest.mark.parametrize("name", ["cstr", "double_pendulum", "linear"])
+def test_plants_and_environments_can_be_copied_and_pickled(name):
+    plant = envs.load(name)
+    for twin in (copy.copy(plant), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant))):
+        np.testing.assert_array_equal(twin.X_LOW, plant.X_LOW)
+        np.testing.assert_array_equal(
+            twin.step(plant.START, plant.U_LOW, plant.PSI_NOMINAL),
+            plant.step(plant.START, plant.U_LOW, plant.PSI_NOMINAL),
+        )
+    for env in (envs.GoalEnv(name), envs.VectorGoalEnv(name, 3)):
+        env.reset(seed=3)
+        action = np.broadcast_to(plant.U_LOW, env.action_space.shape)
+        twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+        expected = env.step(action)[0]["observation"]
+        for twin in twins:
+            np.testing.assert_array_equal(twin.step(action)[0]["observation"], expected)
+
+
+def test_a_mismatch_can_be_copied_and_pickled():
+    plant = envs.load("cstr", observe_mismatch=True)
+    for twin in (copy.copy(plant), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant))):
+        np.testing.assert_array_equal(twin.OBS_HIGH, plant.OBS_HIGH)
+        assert twin.EPISODE_STEPS == 50
+    with pytest.raises(AttributeError):
+        _ = plant.NO_SUCH_NAME
+
+
+def test_stable_baselines3s_own_helper_works_and_render_mode_is_ignored():
+    from stable_baselines3.common.env_util import make_vec_env
+
+    vec = make_vec_env("RLMPC/CSTR-v0", n_envs=2)
+    assert vec.reset()["observation"].shape == (2, 4)
+    assert gym.make_vec("RLMPC/CSTR-v0", num_envs=2, vectorization_mode="sync").reset(seed=0)[0][
+        "observation"
+    ].shape == (2, 4)
+
+
+def test_an_episode_is_truncated_after_its_steps():
+    for env, steps in (
+        (gym.make("RLMPC/CSTR-v0"), 50),
+        (gym.make("RLMPC/CSTR-v0", max_episode_steps=7), 7),
+        (envs.GoalEnv("cstr"), 50),
+    ):
+        env.reset(seed=0)
+        ends = [env.step(np.array([20.0, -1000.0], dtype=np.float32))[3] for _ in range(steps)]
+        assert ends == [False] * (steps - 1) + [True]
+
+
+def test_actions_of_another_shape_are_refused():
+    vec, env = envs.VectorGoalEnv("double_pendulum", 3), envs.GoalEnv("cstr")
+    vec.reset(seed=0), env.reset(seed=0)
+    for bad in (np.array([-5.0, 0.0, 5.0]), np.zeros((1, 1)), np.zeros((3, 2)), np.full((3, 1), np.nan)):
+        with pytest.raises(ValueError, match="action"):
+            vec.step(bad)
+    for bad in (0.0, [1.0], np.zeros((1, 2)), [np.nan, 0.0]):
+        with pytest.raises(ValueError, match="action"):
+            env.step(bad)
+
+
+def test_the_batch_starts_where_it_is_told_to_as_the_single_environment_does():
+    state, goal, psi = np.array([0.8, 0.5, 130.0, 129.0]), np.array([0.7]), np.array([1.02, 0.95])
+    options = {"state": state, "goal": goal, "psi": psi}
+    env, vec = envs.GoalEnv("cstr"), envs.VectorGoalEnv("cstr", 2)
+    for made in (env, vec):
+        obs, _ = made.reset(seed=1, options=options)
+        np.testing.assert_array_equal(np.atleast_2d(obs["observation"])[-1], state)
+    action = np.array([20.0, -1000.0])
+    single = [env.step(action)[0]["observation"] for _ in range(3)]
+    batch = [vec.step(np.tile(action, (2, 1)))[0]["observation"][1] for _ in range(3)]
+    np.testing.assert_allclose(batch, single, rtol=1e-12)
+    state[:] = psi[:] = 0  # what was given was copied
+    assert np.isfinite(env.step(action)[0]["observation"]).all()
+    each = np.array([[0.8, 0.5, 130.0, 129.0], [0.9, 0.6, 120.0, 119.0]])
+    np.testing.assert_array_equal(vec.reset(options={"state": each})[0]["observation"], each)
+    for bad in (
+        {"state": [1.0, 2.0]},
+        {"goal": [0.6, 0.6]},
+        {"psi": [np.nan, 1.0]},
+        {"state": np.zeros((3, 4))},
+    ):
+        with pytest.raises(ValueError, match=f"reset: {next(iter(bad))}"):
+            vec.reset(options=bad)
+
+
+def test_what_estimators_are_given_is_copied():
+    estimator, x, u = envs.Estimator(cstr, "parameters"), cstr.START.copy(), np.array([20.0, -2000.0])
+    found = []
+    for reuse in (False, True):
+        estimator.reset()
+        x[:] = cstr.START
+        for _ in range(4):
+            estimator.before = (x, u) if reuse else (x.copy(), u.copy())
+            x[:] = cstr.step(x, u, np.array([1.03, 0.95]))  # the caller's buffer
+            estimator.update(x if reuse else x.copy())
+        found.append(estimator.shift)
+    np.testing.assert_array_equal(*found)
+
+
+def test_reachable_goals_are_held():
+    plant = envs.load("cstr")
+    (low,), (high,) = envs.reachable_goals(plant, actions=400, steps=300)
+    assert 0.31 <= low < 0.65 < high <= 0.80 + 1e-3
+    for name in ("double_pendulum", "linear"):
+        with pytest.raises(ValueError, match="one goal"):
+            envs.reachable_goals(envs.load(name))
