@@ -40,9 +40,9 @@ from envs.control.compiled import compiled_solver
 from envs.control.controllers import Controller, checked_problem
 from envs.control.model import prediction_model, scaling
 from envs.control.tree_qp import ScenarioTree
-from envs.runs.arguments import check_effects, check_ranges, check_weights, goal_schedule
-from envs.runs.comparison import output_folder, write_csv
-from envs.runs.figure import draw_episode
+from envs.script.arguments import as_annotated, check_effects, check_ranges, check_weights, goal_schedule
+from envs.script.comparison import output_folder, write_csv
+from envs.script.figure import draw_episode
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,8 @@ class Args:
     """write episode.gif of the first episode, with the predicted motion drawn faintly"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__goal_mpc__{seed}__{time}"""
+
+    __post_init__ = as_annotated
 
 
 # Scenario MPC
@@ -221,8 +223,7 @@ class ScenarioMPC(Controller):
             return {"print_time": False, "show_eval_warnings": False, "ipopt": ipopt}
 
         solvers = compiled_solver("ipopt", self.problem, given) if compile else None
-        names = "cold", "warm"
-        return solvers or {name: ca.nlpsol(name, "ipopt", self.problem, given(name)) for name in names}
+        return solvers or {k: ca.nlpsol(k, "ipopt", self.problem, given(k)) for k in ("cold", "warm")}
 
     def build_shift(self):
         """Of w, its multipliers and those of g: which entry each takes over one sampling time later."""
@@ -344,9 +345,8 @@ def build_controller(args, kind=ScenarioMPC):
     default = plant.EXPERT_CHANGE_WEIGHT if args.objective == "expert" else 0.0
     change_weight = default if args.change_weight is None else args.change_weight
     slack_price = np.inf if args.constraints == "hard" else args.slack_weight
-    compiled = args.compile and not hasattr(plant, "next_state")
-    options = dict(goal=goals[0], robust_horizon=args.robust_horizon, slack_price=slack_price)
-    options |= dict(change_weight=change_weight, compile=compiled)
+    options = dict(robust_horizon=args.robust_horizon, slack_price=slack_price, change_weight=change_weight)
+    options |= dict(goal=goals[0], compile=args.compile and not hasattr(plant, "next_state"))
     scenarios = envs.scenario_set(plant, args.scenarios)
     return kind(plant, args.horizon, scenarios, *costs(plant, args.objective, args.sigma2), **options)
 
@@ -446,8 +446,8 @@ def main(args):
     tick = time.perf_counter()
     mpc = build_controller(args)
     variables, constraints = mpc.problem["x"].numel(), mpc.problem["g"].numel()
-    seconds = time.perf_counter() - tick
-    print(f"{plant.ENV_ID}: {variables} variables, {constraints} constraints, built in {seconds:.1f} s")
+    size = f"{plant.ENV_ID}: {variables} variables, {constraints} constraints"
+    print(f"{size}, built in {time.perf_counter() - tick:.1f} s")
     head = {name: getattr(args, name) for name in ("env", "objective", "horizon")}
     given = {k: v for k, v in vars(args).items() if v != getattr(Args, k) and k not in (*head, "seed", "out")}
     head |= {"arguments": json.dumps(given)}
@@ -460,7 +460,7 @@ def main(args):
             rows.append(head | drawn | summary(plant, x, u, goals, log))
             episodes.append((x, u, predicted))
     write_csv(rows, out / "results.csv")
-    x, u = (np.stack(parts) for parts in list(zip(*episodes))[:2])
+    x, u = (np.stack([episode[k] for episode in episodes]) for k in (0, 1))
     np.savez_compressed(out / "trajectories.npz", goals=goals, x=x, u=u)
     draw_episode(plant, {"closed loop": (x[0], u[0], {"color": "#0072B2"})}, goals, out / "episode.png")
     if args.animate:

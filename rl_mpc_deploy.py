@@ -42,9 +42,9 @@ from envs.control.controllers import ActorController, Controller, GreedyControll
 from envs.control.expansion import check_export, expansion
 from envs.control.model import prediction_model, scaling
 from envs.control.tree_qp import ScenarioTree, tree_qp
-from envs.runs.arguments import check_effects, check_ranges, check_weights
-from envs.runs.comparison import draws, output_folder, parallel, run_episode, write_csv
-from envs.runs.figure import draw_episode
+from envs.script.arguments import as_annotated, check_effects, check_ranges, check_weights
+from envs.script.comparison import draws, output_folder, parallel, run_episode, write_csv
+from envs.script.figure import draw_episode
 
 # arguments that results.csv has columns for, or that change no result
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
@@ -71,8 +71,9 @@ class Args:
     horizon: int = 5
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
     critic: Path | None = None
-    """a checkpoint.pt of sac_her_branching.py; default: experiments/pretrained/{env}_constrained.pt, or if there is
-    none {env}_robust.pt (cstr: the first knows the price of constraints, the second is the paper's)"""
+    """a checkpoint.pt of sac_her_branching.py, or latest: the newest of this plant in runs/. Default:
+    experiments/pretrained/{env}_constrained.pt, or if there is none {env}_robust.pt (cstr: the first knows the price
+    of constraints, the second is the paper's)"""
     goal: tuple[float, ...] | None = None
     """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
     episodes: int = 16
@@ -117,6 +118,8 @@ class Args:
     """translate the planners to C and compile them once (kept in $XDG_CACHE_HOME/rlmpc, or ~/.cache/rlmpc)"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__rl_mpc_deploy__{seed}__{time}"""
+
+    __post_init__ = as_annotated
 
 
 # The learned value
@@ -486,6 +489,15 @@ def build_controller(name, args):
 
 
 def critic_path(args):
+    """The checkpoint that the arguments mean. Raises ValueError if it is to be the latest and there is none."""
+    if args.critic == Path("latest"):
+        runs = Path("runs").glob(f"{args.env}__sac_her_branching__*/checkpoint.pt")
+        latest = max(runs, key=lambda path: path.stat().st_mtime, default=None)
+        if latest is None:
+            raise ValueError(
+                f"--critic latest: there is no runs/{args.env}__sac_her_branching__*/checkpoint.pt"
+            )
+        return latest
     folder = Path(__file__).parent / "experiments/pretrained"
     shipped = [folder / f"{args.env}_{kind}.pt" for kind in ("constrained", "robust")]
     return args.critic or next((path for path in shipped if path.exists()), shipped[0])

@@ -42,9 +42,9 @@ import envs
 from envs.agents.checkpoint import FORMAT, RESUME, plain, read_file, save
 from envs.agents.evaluation import evaluation_row, evaluation_table
 from envs.agents.policy import Policy, Scaling, read_policy
-from envs.runs.arguments import check_effects, check_ranges
-from envs.runs.comparison import output_folder, read_trajectories, write_csv
-from envs.runs.interrupt import until_interrupted
+from envs.script.arguments import as_annotated, check_effects, check_ranges
+from envs.script.comparison import output_folder, read_trajectories, write_csv
+from envs.script.interrupt import until_interrupted
 
 # of the arguments that a plant's TRAINING may set
 DEFAULTS = dict(hidden=(64, 64), total_timesteps=100_000, num_envs=32, gamma=0.99, steps_per_update=8)
@@ -132,11 +132,8 @@ class Args:
         if self.observe_mismatch and defaults:
             defaults["gamma"] = min(defaults["gamma"], 0.95)
         for name, value in vars(self).items():
-            value = defaults.get(name) if value is None else value
-            setattr(self, name, value.item() if isinstance(value, np.generic) else value)
-        self.out = Path(self.out)
-        self.add_plant_data = self.add_plant_data and Path(self.add_plant_data)
-        self.hidden = self.hidden and tuple(map(int, self.hidden))
+            setattr(self, name, defaults.get(name) if value is None else value)
+        as_annotated(self)
 
     @property
     def plant_options(self):

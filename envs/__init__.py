@@ -40,7 +40,7 @@ It may name, in place of the default in brackets:
 
 A family of plants (`envs/linear.py`) defines `make(dim, system)`, which returns an object with these names; one with a
 linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline. `plant.py` holds defaults, checks and
-measures, `goal_env.py` the environments, `estimation.py` what transitions tell; `control/`, `agents/` and `runs/` are
+measures, `goal_env.py` the environments, `estimation.py` what transitions tell; `control/`, `agents/` and `script/` are
 what the scripts share beside plants.
 """
 

@@ -147,66 +147,8 @@ def percentage_error(achieved, goal):
     return 100 * np.abs(wrapped).mean(-1) / np.pi
 
 
-def skeleton(x):
-    """Cart, joint and tip in the plane, m, for drawing: x (..., 6) -> (..., 3, 2)."""
-    x = np.asarray(x)
-    cart = np.stack([x[..., 0], 0 * x[..., 0]], axis=-1)
-    joint = cart + LENGTH_1 * np.stack([np.sin(x[..., 1]), np.cos(x[..., 1])], axis=-1)
-    return np.stack(
-        [cart, joint, joint + LENGTH_2 * np.stack([np.sin(x[..., 2]), np.cos(x[..., 2])], axis=-1)], axis=-2
-    )
+def animate(x, u, predicted, goals, path):
+    """GIF of the motion in real time: x (steps + 1, 6), u (steps, 1), predicted (steps, N + 1, 6), goals (steps, 2)."""
+    from envs.script.pendulum_film import animate
 
-
-def animate(x, u, predicted, goals, path, every=2):
-    """GIF of the motion in real time, a frame per `every` steps; the predicted motion is drawn faintly, the goal dotted.
-
-    x (steps + 1, 6), u (steps, 1), predicted (steps, N + 1, 6), goals (steps, 2).
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
-    fig, ax = plt.subplots(figsize=(6, 3.9), layout="constrained")
-    (ghosts,) = ax.plot([], [], color="#56B4E9", lw=1, alpha=0.6)
-    (target,) = ax.plot([], [], ":", color="#CC79A7", lw=3)
-    (rods,) = ax.plot([], [], "-o", color="#0072B2", lw=4, ms=6)
-    (cart,) = ax.plot([], [], "s", color="black", ms=16)
-    (force,) = ax.plot([], [], color="#D55E00", lw=5)
-    clock = ax.text(0.02, 0.93, "", transform=ax.transAxes)
-    ax.legend(
-        [rods, ghosts, target, force],
-        ["rods", "prediction", "goal", "force"],
-        loc="upper right",
-        ncols=4,
-        fontsize=8,
-        frameon=False,
-    )
-    ax.set(ylim=(-1.2, 1.5), aspect="equal", xlabel="position [m]", yticks=[])
-    ax.axhline(0, color="grey", lw=1, zorder=0)
-    for end in (X_LOW[0], X_HIGH[0]):
-        ax.plot([end, end], [-0.35, 0.35], color="black", lw=4)  # the track's ends
-    view = np.convolve(
-        np.pad(skeleton(x)[:, 0, 0], 12, mode="edge"), np.ones(25) / 25, mode="valid"
-    )  # the camera follows the cart
-
-    def draw(t):
-        points = skeleton(x[t])
-        step = max(predicted.shape[1] // 12, 1)
-        faint = skeleton(predicted[t, ::step])
-        ghosts.set_data(*np.concatenate([np.vstack([p, [[np.nan, np.nan]]]) for p in faint]).T)
-        aim = x[t].copy()
-        aim[GOAL_INDEX] = goals[t]
-        target.set_data(*skeleton(aim).T)
-        rods.set_data(*points.T)
-        cart.set_data(points[:1, 0], points[:1, 1])
-        force.set_data([points[0, 0], points[0, 0] + 0.15 * u[t, 0]], [-0.2, -0.2])
-        ax.set_xlim(view[t] - 2.2, view[t] + 2.2)
-        clock.set_text(f"t = {t * DT:4.1f} s")
-
-    frames = range(0, len(u), every)
-    FuncAnimation(fig, draw, frames=frames).save(
-        path, writer=PillowWriter(fps=round(1 / (every * DT), 2)), dpi=80
-    )
-    plt.close(fig)
+    animate(x, u, predicted, goals, path)

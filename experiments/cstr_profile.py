@@ -21,7 +21,7 @@ import cells
 
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.runs.figure import draw_episode
+from envs.script.figure import draw_episode
 
 PAPER = dict(critic=HERE / "pretrained/cstr_robust.pt")
 CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, lines)

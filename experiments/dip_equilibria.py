@@ -21,7 +21,7 @@ import cells
 
 import goal_mpc as gm
 from envs import double_pendulum as plant
-from envs.runs.figure import draw_episode
+from envs.script.figure import draw_episode
 
 
 @dataclass

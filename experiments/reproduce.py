@@ -139,7 +139,7 @@ def version(quick):
     """Of all code that a step may run, and of the budget."""
     code = sorted(
         path
-        for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments")
+        for folder in (".", "envs", "envs/control", "envs/agents", "envs/script", "experiments")
         for path in (ROOT / folder).iterdir()
         if path.suffix in (".py", ".c") and path.name != Path(__file__).name
     )

@@ -23,7 +23,7 @@ from envs.agents.checkpoint import read_checkpoint
 from envs.control import compiled
 from envs.control.controllers import ActorController, GreedyController
 from envs.control.expansion import check_export, expansion, torch_value
-from envs.runs.comparison import draws, run_episode
+from envs.script.comparison import draws, run_episode
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = ROOT / "experiments/pretrained"

@@ -33,7 +33,7 @@ SCRIPTS = {
 }
 SOURCES = [
     path
-    for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments")
+    for folder in (".", "envs", "envs/control", "envs/agents", "envs/script", "experiments")
     for path in sorted((ROOT / folder).glob("*.py"))
 ]
 

@@ -12,6 +12,7 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import double_pendulum as dp
+from envs.script.pendulum_film import skeleton
 
 
 def random_points(n, seed=0):
@@ -107,7 +108,7 @@ def test_equilibria_and_their_names():
     for name, (a, b) in dp.GOALS.items():
         x = np.array([0.3, a, b, 0, 0, 0])
         np.testing.assert_allclose(dp.ode(x, np.zeros(1), dp.PSI_NOMINAL), 0, atol=1e-14)
-        joint, tip = dp.skeleton(x)[1:, 1]
+        joint, tip = skeleton(x)[1:, 1]
         assert [name.split("-")[0], name.split("-")[1]] == [
             "up" if v > 0 else "down" for v in (joint, tip - joint)
         ]

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import envs
 from envs import cstr
-from envs.runs.comparison import new_folder
+from envs.script.comparison import new_folder
 
 
 def random_points(n, seed=0):

@@ -15,7 +15,7 @@ import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import cstr
 from envs.control.expansion import check_export
-from envs.runs.comparison import run_episode
+from envs.script.comparison import run_episode
 
 ROOT = Path(__file__).parent.parent
 NEAR = np.array([0.8, 0.6, 125.0, 122.0])

@@ -12,7 +12,7 @@ import goal_mpc
 import rl_mpc_deploy as deploy
 from envs import cstr
 from envs.control.expansion import expansion
-from envs.runs.comparison import draws, run_episode
+from envs.script.comparison import draws, run_episode
 
 CRITIC = Path(__file__).parent.parent / "experiments/pretrained/cstr_constrained.pt"
 SCENARIOS, GOAL, HORIZON = cstr.SCENARIOS["mpc"], cstr.EVAL_GOAL, 5

@@ -13,7 +13,7 @@ import pytest
 import rl_mpc_deploy as deploy
 from envs import cstr
 from envs.control.tree_qp import ConicQP, ScenarioTree, TreeQP
-from envs.runs.comparison import draws, run_episode
+from envs.script.comparison import draws, run_episode
 
 pytestmark = pytest.mark.skipif(
     not any(map(shutil.which, ("gcc", "clang", "cc"))), reason="HPIPM's solver is compiled"

@@ -30,7 +30,7 @@ def evaluate(policy, goal, episodes, robust, seed=SEED):
 
 
 def evaluation_row(policy, episodes):
-    """Medians and 75th percentiles that evaluations.csv and tensorboard report, in percent."""
+    """Medians and 75th percentiles that evaluations.csv and tensorboard report, in percent. Raises ValueError if they are not finite."""
     row = {}
     for name in ("robust", "nominal"):
         errors, outside, held_out = evaluate(policy, policy.plant.EVAL_GOAL, episodes, name == "robust")
@@ -41,6 +41,8 @@ def evaluation_row(policy, episodes):
             f"{name}_median_outside": np.median(outside),
             f"{name}_p75_outside": np.quantile(outside, 0.75),
         }
+    if not np.isfinite(list(row.values())).all():
+        raise ValueError("the agent's actions are not finite: training diverged; try a lower --learning-rate")
     return {name: float(value) for name, value in row.items()}
 
 
@@ -49,8 +51,6 @@ def evaluation_table(row):
     lines = ["median [75th percentile] over starts      error, %      time outside constraints, %"]
     for name in ("robust", "nominal"):
         columns = [(row[f"{name}_median_{key}"], row[f"{name}_p75_{key}"]) for key in ("ape", "outside")]
-        lines.append(
-            f"{name} evaluation".ljust(20)
-            + "".join(f"{median:17.2f} [{p75:6.2f}]" for median, p75 in columns)
-        )
+        shown = "".join(f"{median:17.2f} [{p75:6.2f}]" for median, p75 in columns)
+        lines.append(f"{name} evaluation".ljust(20) + shown)
     return "\n".join(lines)

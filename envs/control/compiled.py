@@ -52,19 +52,30 @@ def compiled(source, *flags, link=("-lm",)):
     ).hexdigest()[:32]
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rlmpc"
     library = cache / f"{key}.so"
-    if not library.exists():
+    if not _whole(library):
         cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(
-            dir=cache
-        ) as folder:  # linked apart: fast-math, linked in, would change the whole process
-            (Path(folder) / "source.c").write_text(source)
-            run = lambda *command: subprocess.run(
-                [compiler, *command], check=True, capture_output=True, cwd=folder
-            )  # noqa: E731
+        with tempfile.TemporaryDirectory(dir=cache) as folder:
+            folder = Path(folder)
+
+            def run(*command):
+                subprocess.run([compiler, *command], check=True, capture_output=True, cwd=folder)
+
+            (folder / "source.c").write_text(source, encoding="utf-8")
             run(*FLAGS, *flags, "-c", "source.c")
+            # linked apart: fast-math, linked in, would change the whole process
             run("-shared", "source.o", "-o", "library.so", *link)
-            os.replace(Path(folder) / "library.so", library)
+            built = (folder / "library.so").read_bytes()
+            (folder / "library.so").write_bytes(built + hashlib.sha256(built).digest())
+            os.replace(folder / "library.so", library)
     return library
+
+
+def _whole(library):
+    """Whether the file is there and ends with its checksum, which loaders ignore: half a library kills the process that loads it."""
+    if not library.exists():
+        return False
+    content = library.read_bytes()
+    return hashlib.sha256(content[:-32]).digest() == content[-32:]
 
 
 def _notice(error):

@@ -15,7 +15,9 @@ import envs
 
 def draws(plant, episodes, seed):
     """Start states (episodes, n_x) uniform in their box and plants (episodes, n_psi) from the evaluation set."""
-    rngs = [np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)]  # of any number, the first are the same
+    rngs = [
+        np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)
+    ]  # of any number, the first are the same
     starts = np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs])
     return starts, np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
 
@@ -48,13 +50,26 @@ def read_trajectories(path, plant):
     """States (E, T + 1, n_x) and actions (E, T, n_u) of every controller in a trajectories.npz. Raises ValueError."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            x, u = (np.concatenate([data[name] for name in sorted(data.files) if name.endswith(end)]) for end in ("_x", "_u"))
-        if not (x.shape[0], x.shape[1] - 1, *x.shape[2:], u.shape[2]) == (*u.shape[:2], len(plant.X_LOW), len(plant.U_LOW)):
+            x, u = (
+                np.concatenate([data[name] for name in sorted(data.files) if name.endswith(end)])
+                for end in ("_x", "_u")
+            )
+        if not (x.shape[0], x.shape[1] - 1, *x.shape[2:], u.shape[2]) == (
+            *u.shape[:2],
+            len(plant.X_LOW),
+            len(plant.U_LOW),
+        ):
             raise ValueError
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
             raise ValueError
-    except Exception as error:  # missing, truncated, not an archive, of another plant: one sentence for all of them
-        reason = f"not a trajectories.npz of {plant.ENV_ID} ({type(error).__name__})" if path.exists() else "does not exist"
+    except (
+        Exception
+    ) as error:  # missing, truncated, not an archive, of another plant: one sentence for all of them
+        reason = (
+            f"not a trajectories.npz of {plant.ENV_ID} ({type(error).__name__})"
+            if path.exists()
+            else "does not exist"
+        )
         raise ValueError(f"{path}: {reason}") from None
     return x, u
 

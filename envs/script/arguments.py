@@ -1,10 +1,25 @@
 """Checks of a script's arguments: ValueError, one sentence that names the argument, its value and what is allowed."""
 
+from pathlib import Path
 from typing import Literal, get_args, get_origin
 
 import numpy as np
 
 import envs
+
+
+def as_annotated(args):
+    """Put what Python gave into the types of the command line: lists, arrays and single numbers as tuples, text as paths, plain numbers."""
+    for name, kind in type(args).__annotations__.items():
+        value, kinds = getattr(args, name), get_args(kind) or (kind,)
+        if isinstance(value, np.generic):
+            value = value.item()
+        listed = any(get_origin(each) is tuple for each in (kind, *kinds))
+        if listed and value is not None and not isinstance(value, tuple):
+            value = (value,) if isinstance(value, str) else tuple(np.atleast_1d(value).tolist())
+        if Path in kinds and isinstance(value, str):
+            value = Path(value)
+        object.__setattr__(args, name, value)
 
 
 def flag(name):
@@ -20,7 +35,9 @@ def check_ranges(args, **ranges):
             raise ValueError(f"{flag(name)} is {value}; it must lie in [{least:g}, {most:g}]")
     for name, kind in type(args).__annotations__.items():
         if get_origin(kind) is Literal and getattr(args, name) not in get_args(kind):
-            raise ValueError(f"{flag(name)} is {getattr(args, name)!r}; choose one of {', '.join(get_args(kind))}")
+            raise ValueError(
+                f"{flag(name)} is {getattr(args, name)!r}; choose one of {', '.join(get_args(kind))}"
+            )
 
 
 def check_effects(args, without_effect):

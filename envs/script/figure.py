@@ -1,36 +1,43 @@
 """The figure of an episode."""
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+
+def new_figure(**options):
+    """A matplotlib figure that is drawn into files, whatever backend the caller's own figures have."""
+    figure = Figure(**options)
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def wrapped(angle):
-    """Angles moved into [-pi/2, 3 pi/2), so that neither upright (0) nor hanging (pi) is at the edge; jumps are cut by NaN."""
+    """Angles in [-pi/2, 3 pi/2), so that neither upright (0) nor hanging (pi) is at the edge; jumps are cut by NaN."""
     angle = (np.asarray(angle) + np.pi / 2) % (2 * np.pi) - np.pi / 2
     return np.where(np.abs(np.diff(angle, prepend=angle[:1])) > np.pi, np.nan, angle)
 
 
 def draw_episode(plant, paths, goals, path):
-    """A panel per goal state, bounded state and action, with bounds and goal: up to four below each other, more in three columns.
+    """A panel per goal state, state with any bound, and action: up to four below each other, more in three columns.
 
-    paths: {label: (x (steps + 1, n_x), u (steps, n_u), matplotlib options of its lines)}; goals: (steps, n_goal), those of x_1 ...
+    paths: {label: (x (steps + 1, n_x), u (steps, n_u), matplotlib options of its lines)}; goals: (steps, n_goal), those
+    of x_1 ...
     """
-    import matplotlib  # here, so that importing a script leaves its backend alone
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     n_x = len(plant.X_LOW)
-    low, high = np.concatenate([plant.X_LOW, plant.U_LOW]), np.concatenate([plant.X_HIGH, plant.U_HIGH])
-    titles = [f"{n} [{unit}]" for n, unit in zip(plant.STATE_NAMES + plant.ACTION_NAMES, plant.STATE_UNITS + plant.ACTION_UNITS)]
-    shown = [i for i in range(len(low)) if i in plant.GOAL_INDEX or np.isfinite(low[i])]
+    low, high = np.append(plant.X_LOW, plant.U_LOW), np.append(plant.X_HIGH, plant.U_HIGH)
+    names = [*zip(plant.STATE_NAMES, plant.STATE_UNITS), *zip(plant.ACTION_NAMES, plant.ACTION_UNITS)]
+    titles = [f"{name} [{unit}]" for name, unit in names]
+    bounded = np.isfinite(low) | np.isfinite(high)
+    shown = [i for i in range(len(low)) if i in plant.GOAL_INDEX or bounded[i]]
     if len(shown) > 12:  # of a large plant, the first few
         shown = [i for i in shown if i < 4 or n_x <= i < n_x + 2]
         titles[0] += f" (4 of {n_x} states)"
     columns = 1 if len(shown) <= 4 else 3
     rows = -(-len(shown) // columns)
     size = (8, 0.7 + 1.5 * rows) if columns == 1 else (10, 0.8 + 2.2 * rows)
-    fig, axes = plt.subplots(rows, columns, figsize=size, sharex=True, layout="constrained", squeeze=False)
-    axes = axes.ravel()
+    figure = new_figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     times = np.arange(len(goals) + 1) * plant.DT
     for ax, i in zip(axes, shown):
         angle = i in plant.ANGLES
@@ -40,10 +47,10 @@ def draw_episode(plant, paths, goals, path):
             ax.plot(times, goal, color="#CC79A7", lw=2, ls=(0, (1, 1)), drawstyle="steps-pre", label="goal")
         for label, (x, u, style) in paths.items():
             values = np.hstack([x, np.vstack([u, u[-1:]])])[:, i]
-            drawstyle = "default" if i < n_x else "steps-post"
-            ax.plot(times, wrapped(values) if angle else values, **{"lw": 1.8, "drawstyle": drawstyle, "label": label} | style)
+            options = {"lw": 1.8, "drawstyle": "default" if i < n_x else "steps-post", "label": label} | style
+            ax.plot(times, wrapped(values) if angle else values, **options)
         for bound in filter(np.isfinite, (low[i], high[i])):
-            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound" if bound == low[i] else None)
+            ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound")
         if angle:
             ax.set_yticks([0, np.pi], ["0 (up)", "π (down)"])
             ax.set_ylim(-np.pi / 2 - 0.1, 3 * np.pi / 2 + 0.1)
@@ -55,6 +62,6 @@ def draw_episode(plant, paths, goals, path):
         ax.xaxis.set_tick_params(labelbottom=True)
         ax.set_xlabel(f"time [{plant.TIME_UNIT}]")
     handles = {text: h for ax in axes for h, text in zip(*ax.get_legend_handles_labels())}
-    fig.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
+    legend = dict(loc="outside upper center", ncols=min(len(handles), 4), frameon=False, fontsize=9)
+    figure.legend(handles.values(), handles.keys(), **legend)
+    figure.savefig(path, dpi=150)
