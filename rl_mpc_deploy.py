@@ -478,7 +478,7 @@ def build_controller(name, args):
         stage = ca.Function("stage", [x, g], [squared_error])
         return ScenarioMPC(plant, benchmark["horizon"], scenarios, stage, **options)
     sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
-    stage = ca.Function("stage", [x, g], [-ca.exp(-squared_error / (2 * sigma2))])
+    stage = ca.Function("stage", [x, g], [plant.economic_cost(x, ca) - ca.exp(-squared_error / (2 * sigma2))])
     slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
     price = slack_weight if args.constraints == "soft" else np.inf
     change = args.change_weight or 0.0

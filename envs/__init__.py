@@ -35,6 +35,7 @@ It may name, in place of the default in brackets:
     TRAINING                    arguments of sac_her_branching.py whose defaults it changes ({})
     BENCHMARK                   the MPC that rl_mpc_deploy.py compares with: "horizon" (20), "slack_price" (2, n_x) below
                                 and above, inf: a hard bound (all), "change_weight" (n_u,) (0)
+    economic_cost(x, xp)        added to RL+MPC's stage cost, to choose among steady states that hold a goal (0)
     MISMATCH_SCALE              for --observe-mismatch: a large difference to the model after one step, (n_x,)
     GOALS, expert_cost, EXPERT_CHANGE_WEIGHT, animate    for goal_mpc.py: goals by name, another objective, a film
 

@@ -1,9 +1,9 @@
-"""Double inverted pendulum on a cart, the paper's Example 1: the benchmark of Fiedler et al. (2023), do-mpc's `DIP` example.
+"""Double inverted pendulum on a cart, the paper's Example 1: the benchmark of Fiedler et al. (2023), do-mpc's `DIP`.
 
-A horizontal force moves a cart that carries two uniform rods in series. Angles are measured from the upright position, both against
-the vertical. The three masses are uncertain. Departures from the benchmark: the rods' accelerations are solved for (a symmetric 3 x 3
-mass matrix) where it hands an implicit system to a DAE solver, and its kinetic energy takes the first rod's angular rate in the second
-rod's rotational term, here corrected.
+A horizontal force moves a cart that carries two uniform rods in series. Angles are measured from the upright position,
+both against the vertical. The three masses are uncertain. Departures from the benchmark: the rods' accelerations are
+solved for (a symmetric 3 x 3 mass matrix) where it hands an implicit system to a DAE solver, and its kinetic energy
+takes the first rod's angular rate in the second rod's rotational term, here corrected.
 """
 
 import numpy as np
@@ -21,20 +21,16 @@ X_LOW = np.array([-5.0, -np.inf, -np.inf, -np.inf, -np.inf, -np.inf])  # the tra
 X_HIGH = -X_LOW
 INIT_LOW = np.array([-1.0, -np.pi, -np.pi, -1.0, -5.0, -5.0])
 INIT_HIGH = -INIT_LOW
-OBS_LOW = np.array(
-    [-200.0, -1000.0, -1000.0, -100.0, -200.0, -200.0]
-)  # far beyond what 5 N and the initial energy reach in an episode
+# far beyond what 5 N and the initial energy reach in an episode
+OBS_LOW = np.array([-200.0, -1000.0, -1000.0, -100.0, -200.0, -200.0])
 OBS_HIGH = -OBS_LOW
 ANGLES = [1, 2]  # the networks see them as sine and cosine
 START = np.array([0.0, 0.9 * np.pi, 0.9 * np.pi, 0.0, 0.0, 0.0])  # the paper's: at rest, nearly hanging
-START_NOISE = np.array(
-    [0.0, 0.05, 0.05, 0.0, 0.0, 0.0]
-)  # half-width of what the seed of goal_mpc.py adds to it
+START_NOISE = np.array([0.0, 0.05, 0.05, 0.0, 0.0, 0.0])  # half-width of what the seed of goal_mpc.py adds
 
 ACTION_NAMES = ("force",)
 ACTION_UNITS = ("N",)
 U_LOW, U_HIGH = np.array([-5.0]), np.array([5.0])
-
 
 PSI_NAMES = ("cart_mass", "rod_1_mass", "rod_2_mass")  # factors of the nominal masses
 PSI_NOMINAL = np.ones(3)
@@ -46,23 +42,16 @@ SCENARIOS = {
 }
 EVAL_PSI = grid(*[np.linspace(0.95, 1.05, 7)] * 3)
 
-BENCHMARK = {
-    "horizon": 25,
-    "slack_price": 1e3 * np.ones((2, 6)),
-    "change_weight": np.zeros(1),
-}  # the quadratic agent
+# the quadratic agent
+BENCHMARK = {"horizon": 25, "slack_price": 1e3 * np.ones((2, 6)), "change_weight": np.zeros(1)}
 EXPERT_CHANGE_WEIGHT = np.array([0.1])  # 1/N^2, of the expert agent's penalty on changes of the force
 
 GOAL_INDEX = [1, 2]  # the goal is a pair of angles, rad
-GOALS = {
-    "up-up": (0.0, 0.0),
-    "up-down": (0.0, np.pi),
-    "down-up": (np.pi, 0.0),
-}  # the unstable equilibria, inner rod first
+# the unstable equilibria, inner rod first
+GOALS = {"up-up": (0.0, 0.0), "up-down": (0.0, np.pi), "down-up": (np.pi, 0.0)}
 TRAIN_GOALS = np.array(list(GOALS.values()))
 EVAL_GOAL = np.array(GOALS["up-up"])
 GOAL_LOW, GOAL_HIGH = -np.pi * np.ones(2), np.pi * np.ones(2)
-GOAL_REACHABLE = (GOAL_LOW, GOAL_HIGH)  # of these the ones that `held_action` can hold
 ERROR_SCALE = np.ones(2)  # not used: both goals are angles
 REWARD_SIGMA2 = 0.01  # of 1 - cos(error)
 REWARD_TOLERANCE = 0.02  # 1 - cos of 0.2 rad
@@ -76,19 +65,20 @@ LENGTH_1, LENGTH_2 = 0.5, 0.5  # m, of the rods; their centres of mass are in th
 CENTRE_1, CENTRE_2 = LENGTH_1 / 2, LENGTH_2 / 2  # m
 
 
-def _masses(psi):
+def masses(psi):
+    """Of cart and rods, kg."""
     return CART_MASS * psi[0], ROD_1_MASS * psi[1], ROD_2_MASS * psi[2]
 
 
 def ode(x, u, psi, xp=np):
-    """Time derivative, per second. Components along the first axis: x (6, ...), u (1, ...), psi (3, ...); xp is numpy, torch or casadi."""
+    """Time derivative, per second; components along the first axis; xp is numpy, torch or casadi."""
     theta_1, theta_2, omega_1, omega_2 = x[1], x[2], x[4], x[5]
-    cart, rod_1, rod_2 = _masses(psi)
+    cart, rod_1, rod_2 = masses(psi)
     moment_1, moment_2 = rod_1 * CENTRE_1 + rod_2 * LENGTH_1, rod_2 * CENTRE_2  # kg m
     coupling = rod_2 * CENTRE_2 * LENGTH_1  # kg m^2
     sin_1, cos_1, sin_2, cos_2 = xp.sin(theta_1), xp.cos(theta_1), xp.sin(theta_2), xp.cos(theta_2)
     sin_12, cos_12 = sin_1 * cos_2 - cos_1 * sin_2, cos_1 * cos_2 + sin_1 * sin_2
-    # mass matrix [[m00, m01, m02], [m01, m11, m12], [m02, m12, m22]] and generalised forces b; a rod's inertia is m L^2 / 12
+    # symmetric mass matrix m and generalised forces b; a rod's inertia is m L^2 / 12
     m00, m01, m02 = cart + rod_1 + rod_2, moment_1 * cos_1, moment_2 * cos_2
     m11 = rod_1 * (CENTRE_1**2 + LENGTH_1**2 / 12) + rod_2 * LENGTH_1**2
     m12, m22 = coupling * cos_12, rod_2 * (CENTRE_2**2 + LENGTH_2**2 / 12)
@@ -107,48 +97,20 @@ def ode(x, u, psi, xp=np):
 step = stepper(ode, DT)  # x (..., 6), u (..., 1), psi (..., 3) -> (..., 6)
 
 
-def kinetic_energy(x, psi=PSI_NOMINAL, xp=np):
-    """Kinetic energy in J, x (6, ...) -> (...)."""
-    cart, rod_1, rod_2 = _masses(psi)
-    velocity, omega_1, omega_2 = x[3], x[4], x[5]
-    sin_1, cos_1, sin_2, cos_2 = xp.sin(x[1]), xp.cos(x[1]), xp.sin(x[2]), xp.cos(x[2])
-    across_1, along_1 = velocity + CENTRE_1 * omega_1 * cos_1, CENTRE_1 * omega_1 * sin_1
-    across_2 = velocity + LENGTH_1 * omega_1 * cos_1 + CENTRE_2 * omega_2 * cos_2
-    along_2 = LENGTH_1 * omega_1 * sin_1 + CENTRE_2 * omega_2 * sin_2
-    translation = cart * velocity**2 + rod_1 * (across_1**2 + along_1**2) + rod_2 * (across_2**2 + along_2**2)
-    return 0.5 * (translation + rod_1 * LENGTH_1**2 / 12 * omega_1**2 + rod_2 * LENGTH_2**2 / 12 * omega_2**2)
-
-
-def potential_energy(x, psi=PSI_NOMINAL, xp=np):
-    """Potential energy in J, zero with both rods level, x (6, ...) -> (...)."""
-    _, rod_1, rod_2 = _masses(psi)
-    height_1, height_2 = CENTRE_1 * xp.cos(x[1]), LENGTH_1 * xp.cos(x[1]) + CENTRE_2 * xp.cos(x[2])
-    return GRAVITY * (rod_1 * height_1 + rod_2 * height_2)
-
-
 def expert_cost(x, xp=np):
-    """Stage and terminal cost of the paper's expert agent, J: kinetic minus potential energy, which has no goal as its argument."""
+    """Stage and terminal cost of the paper's expert agent, J: kinetic minus potential energy, whatever the goal."""
+    from envs.script.pendulum import kinetic_energy, potential_energy
+
     return kinetic_energy(x, xp=xp) - potential_energy(x, xp=xp)
 
 
 def held_action(goal):
-    """The force (1,) that holds both angles still: none, if each rod stands or hangs; else there is no such force (infinite)."""
+    """The force (1,) that holds both angles: none, if each rod stands or hangs; else infinite, there is none."""
     return np.zeros(1) if np.allclose(np.sin(goal), 0, atol=1e-6) else np.full(1, np.inf)
-
-
-def goal_error(achieved, goal, xp=np):
-    """Elementwise error whose squared norm enters the Gaussian reward: 1 - cos of the angles' differences (eq:smoothreward)."""
-    return 1 - xp.cos(achieved - goal)
-
-
-def percentage_error(achieved, goal):
-    """Mean absolute error of the two angles, shortest way round, in percent of pi, (..., 2) -> (...)."""
-    wrapped = (achieved - goal + np.pi) % (2 * np.pi) - np.pi
-    return 100 * np.abs(wrapped).mean(-1) / np.pi
 
 
 def animate(x, u, predicted, goals, path):
     """GIF of the motion in real time: x (steps + 1, 6), u (steps, 1), predicted (steps, N + 1, 6), goals (steps, 2)."""
-    from envs.script.pendulum_film import animate
+    from envs.script.pendulum import animate
 
     animate(x, u, predicted, goals, path)

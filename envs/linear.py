@@ -8,47 +8,10 @@ from functools import cache
 
 import numpy as np
 
+from envs.control.linear_systems import discounted_lqr, random_matrix
+
 STEPS = 50
-SPECTRAL_RADIUS = 1.1  # at most
-SINGULAR_VALUE_MIN = 0.1  # of tanh(D), so that A has an inverse that is not huge
-CONDITION_MAX = 10.0  # of L at off_diagonal = 1; another is drawn where it is larger
 STATE_BOUND = 1.5  # soft, of every state; initial states lie in [-1, 1]
-
-
-def random_matrix(n, rng, off_diagonal=1.0, entries="symmetric"):
-    """A random (n, n) matrix with spectral radius at most 1.1 and the L that made it (section app:LQ-GC).
-
-    M = U tanh(D) V' from the singular value decomposition of a matrix with entries uniform in [-1, 1] ("symmetric") or in [0, 1]
-    ("positive"), its singular values clipped and scaled to [0.11, 1.1]; then A = L^-1 M L. What the paper leaves open: the triangular L
-    has entries uniform in [-off_diagonal, off_diagonal] / sqrt(n) below a diagonal uniform in [0.5, 1.5], and a condition number of at
-    most 10. With entries that do not shrink with n, L and with it the norm of A grow without bound (a median norm of 4e6 at n = 32).
-    """
-    u, d, vt = np.linalg.svd(rng.uniform(-1 if entries == "symmetric" else 0, 1, size=(n, n)))
-    m = u @ np.diag(SPECTRAL_RADIUS * np.clip(np.tanh(d), SINGULAR_VALUE_MIN, 1)) @ vt
-    while True:
-        below = np.tril(rng.uniform(-off_diagonal, off_diagonal, size=(n, n)) / np.sqrt(n), -1)
-        transform = below + np.diag(rng.uniform(0.5, 1.5, size=n))
-        if np.linalg.cond(transform) <= CONDITION_MAX * max(1, off_diagonal) ** 2:
-            return np.linalg.solve(transform, m @ transform), transform
-
-
-def bellman_step(a, b, m, r, gamma, p):
-    """One value iteration: (P, K) that minimise x'Mx + u'Ru + gamma (Ax + Bu)' p (Ax + Bu) over u = -K x (eq:bellmanLQR)."""
-    k = gamma * np.linalg.solve(r + gamma * b.T @ p @ b, b.T @ p @ a)
-    closed = a - b @ k
-    return m + k.T @ r @ k + gamma * closed.T @ p @ closed, k
-
-
-def discounted_lqr(a, b, m, r, gamma=1.0):
-    """P and K of min sum gamma^t (x'Mx + u'Ru), u = -K x: the solution of the discounted Riccati equation of section app:lqr.
-
-    It is the undiscounted one of sqrt(gamma) A, sqrt(gamma) B. The closed loop A - B K need only be stable when multiplied by
-    sqrt(gamma): as gamma goes to 0, so does K.
-    """
-    from scipy.linalg import solve_discrete_are
-
-    p = solve_discrete_are(np.sqrt(gamma) * a, np.sqrt(gamma) * b, m, r)
-    return p, bellman_step(a, b, m, r, gamma, p)[1]
 
 
 class Linear:
@@ -58,22 +21,13 @@ class Linear:
     ANGLES, PSI_NAMES, PSI_NOMINAL, MODEL_SUBSTEPS = [], (), np.zeros(0), 1
     SCENARIOS = {name: np.zeros((1, 0)) for name in ("nominal", "mpc", "robust")}
     EVAL_PSI = np.zeros((1, 0))
-    REWARD_SIGMA2, REWARD_TOLERANCE = (
-        0.25,
-        0.1,
-    )  # squared norm of the state; half-width of the 0/1 reward in every state
+    REWARD_SIGMA2 = 0.25  # squared norm of the state
+    REWARD_TOLERANCE = 0.1  # half-width of the 0/1 reward in every state
     MPC_SIGMA2 = 0.5  # exp(-l) of eq:jensen
     METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints
     # what sac_her_branching.py trains with: over 90,000 parameters per network at n = 32
-    TRAINING = {
-        "hidden": (256, 256),
-        "total_timesteps": 500_000,
-        "num_envs": 64,
-        "gamma": 0.9,
-        "learning_starts": 10_000,
-        "steps_per_update": 16,
-        "alpha_init": 0.005,
-    }
+    TRAINING = dict(hidden=(256, 256), total_timesteps=500_000, num_envs=64, gamma=0.9)
+    TRAINING |= dict(learning_starts=10_000, steps_per_update=16, alpha_init=0.005)
 
     def __init__(self, a, transform=None):
         n = len(a)
@@ -92,16 +46,14 @@ class Linear:
         self.OBS_LOW = -self.OBS_HIGH
         self.BENCHMARK = {"horizon": 10, "slack_price": np.ones((2, n)), "change_weight": np.zeros(n)}
         self.GOAL_INDEX, self.EVAL_GOAL = list(range(n)), np.zeros(n)
-        # 1,000 goals, each uniform in a box whose half-width is uniform in [0, 1]. The origin alone would be a goal that the critic
-        # recognises and, since it is missed at first, learns to be worth nothing
+        # each uniform in a box whose half-width is uniform in [0, 1]. The origin alone would be a goal that the
+        # critic recognises and, since it is missed at first, learns to be worth nothing
         rng = np.random.default_rng(0)
         self.TRAIN_GOALS = rng.uniform(0, 1, size=(1000, 1)) * rng.uniform(-1, 1, size=(1000, n))
         self.GOAL_LOW, self.GOAL_HIGH = -one, one
         held = 1 / np.abs(np.eye(n) - a).sum(axis=1)  # a goal is held by u = (I - A) g
-        self.GOAL_REACHABLE = (
-            -held.min() * one,
-            held.min() * one,
-        )  # a cube within the goals that envs.can_hold tells exactly
+        # a cube within the goals that envs.can_hold tells exactly
+        self.GOAL_REACHABLE = -held.min() * one, held.min() * one
         self.ERROR_SCALE = one
         self.solved = {}  # discount: P and K
 

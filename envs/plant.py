@@ -169,7 +169,12 @@ def _defaults(p):
     benchmark = dict(
         horizon=20, slack_price=np.full((2, len(half)), np.inf), change_weight=np.zeros(len(p.U_LOW))
     )
-    values |= dict(BENCHMARK=benchmark, goal_error=goal_error, percentage_error=percentage_error)
+    values |= dict(
+        BENCHMARK=benchmark,
+        economic_cost=lambda x, xp=np: 0,
+        goal_error=goal_error,
+        percentage_error=percentage_error,
+    )
     if hasattr(p, "ode"):
         values["step"] = stepper(p.ode, p.DT)
     else:

@@ -18,12 +18,14 @@ import tyro
 import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
-from envs import cstr, double_pendulum
+from envs import cstr
 from envs.agents.checkpoint import read_checkpoint
 from envs.control import compiled
 from envs.control.controllers import ActorController, GreedyController
 from envs.control.expansion import check_export, expansion, torch_value
 from envs.script.comparison import draws, run_episode
+
+double_pendulum = envs.load("double_pendulum")
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = ROOT / "experiments/pretrained"

@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
-from envs import double_pendulum as dp
-from envs.script.pendulum_film import skeleton
+from envs.script.pendulum import kinetic_energy, potential_energy, skeleton
+
+dp = envs.load("double_pendulum")
 
 
 def random_points(n, seed=0):
@@ -27,12 +28,12 @@ def test_energy_is_conserved_without_force():
     psi, force = np.tile([1.0, 0.97, 1.04], (6, 1)), np.zeros((6, 1))
 
     def energy(x):
-        return dp.kinetic_energy(x.T, psi.T) + dp.potential_energy(x.T, psi.T)
+        return kinetic_energy(x.T, psi.T) + potential_energy(x.T, psi.T)
 
     start, scale = (
         energy(x),
         np.ptp(
-            dp.potential_energy(np.array([[0, 0], [0, np.pi], [0, np.pi], [0, 0], [0, 0], [0, 0]]), psi[:2].T)
+            potential_energy(np.array([[0, 0], [0, np.pi], [0, np.pi], [0, 0], [0, 0], [0, 0]]), psi[:2].T)
         ),
     )
     for _ in range(250):
@@ -94,8 +95,8 @@ def test_the_same_lines_serve_numpy_torch_and_casadi():
     symbols = [ca.SX.sym(name, n) for name, n in (("x", 6), ("u", 1), ("psi", 3))]
     for function in (
         dp.ode,
-        lambda x, u, psi, xp: dp.kinetic_energy(x, psi, xp),
-        lambda x, u, psi, xp: dp.potential_energy(x, psi, xp),
+        lambda x, u, psi, xp: kinetic_energy(x, psi, xp),
+        lambda x, u, psi, xp: potential_energy(x, psi, xp),
     ):
         expected = np.atleast_2d(function(x.T, u.T, psi.T, np))
         in_torch = np.atleast_2d(function(*(torch.tensor(a.T) for a in (x, u, psi)), torch).numpy())

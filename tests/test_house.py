@@ -22,6 +22,7 @@ from envs.script.figure import draw_episode
 
 ROOT = Path(__file__).parent.parent
 LINES = {"sac_her_branching.py": 520, "goal_mpc.py": 480, "rl_mpc_deploy.py": 640}
+LINES |= {f"envs/{name}.py": 120 for name in ("cstr", "double_pendulum", "linear")}
 
 
 @pytest.mark.parametrize("name, most", LINES.items())

@@ -20,6 +20,7 @@ import goal_mpc as gm
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import linear
+from envs.control import linear_systems
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "experiments"))
@@ -79,7 +80,7 @@ def test_regulator_against_scipy_and_the_bellman_equation(gamma):
     rng = np.random.default_rng(3)
     a, b = linear.make(5, 1).A, rng.normal(size=(5, 2))
     m, r = np.diag(rng.uniform(0.5, 2, 5)), np.diag(rng.uniform(0.5, 2, 2))
-    p, k = linear.discounted_lqr(a, b, m, r, gamma)
+    p, k = linear_systems.discounted_lqr(a, b, m, r, gamma)
     np.testing.assert_allclose(p, solve_discrete_are(np.sqrt(gamma) * a, np.sqrt(gamma) * b, m, r), rtol=1e-8)
     dare = (
         m
@@ -90,7 +91,7 @@ def test_regulator_against_scipy_and_the_bellman_equation(gamma):
     np.testing.assert_allclose(k, gamma * np.linalg.inv(r + gamma * b.T @ p @ b) @ b.T @ p @ a, rtol=1e-8)
     iterate = np.zeros((5, 5))
     for _ in range(3000):
-        iterate, gain = linear.bellman_step(a, b, m, r, gamma, iterate)
+        iterate, gain = linear_systems.bellman_step(a, b, m, r, gamma, iterate)
     np.testing.assert_allclose(iterate, p, rtol=1e-6)
     np.testing.assert_allclose(gain, k, atol=1e-6)
     x, total = np.ones(5), 0.0  # and against the sum of costs along its own closed loop
@@ -119,7 +120,7 @@ def test_cost_with_a_linear_tail_falls_with_the_horizon(gamma):
     x, costs = np.array([1.0, -0.5, 0.3, 0.8]), []
     for _ in range(20):
         costs.append(x @ p @ x)
-        p = linear.bellman_step(a, one, one, one, gamma, p)[0]
+        p = linear_systems.bellman_step(a, one, one, one, gamma, p)[0]
     assert (np.diff(costs) <= 1e-12).all() and costs[0] > costs[1] + 1e-3
     assert costs[-1] == pytest.approx(x @ plant.lqr(gamma)[0] @ x, rel=1e-6)
 

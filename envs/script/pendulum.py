@@ -1,10 +1,36 @@
-"""The double pendulum's film."""
+"""The double pendulum's energies, for the paper's expert, and its film."""
 
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 from envs import double_pendulum as plant
 from envs.script.figure import new_figure
+
+
+def kinetic_energy(x, psi=plant.PSI_NOMINAL, xp=np):
+    """Kinetic energy in J, x (6, ...) -> (...)."""
+    cart, rod_1, rod_2 = plant.masses(psi)
+    velocity, omega_1, omega_2 = x[3], x[4], x[5]
+    sin_1, cos_1, sin_2, cos_2 = xp.sin(x[1]), xp.cos(x[1]), xp.sin(x[2]), xp.cos(x[2])
+    across_1, along_1 = velocity + plant.CENTRE_1 * omega_1 * cos_1, plant.CENTRE_1 * omega_1 * sin_1
+    across_2 = velocity + plant.LENGTH_1 * omega_1 * cos_1 + plant.CENTRE_2 * omega_2 * cos_2
+    along_2 = plant.LENGTH_1 * omega_1 * sin_1 + plant.CENTRE_2 * omega_2 * sin_2
+    translation = cart * velocity**2 + rod_1 * (across_1**2 + along_1**2) + rod_2 * (across_2**2 + along_2**2)
+    return 0.5 * (
+        translation
+        + rod_1 * plant.LENGTH_1**2 / 12 * omega_1**2
+        + rod_2 * plant.LENGTH_2**2 / 12 * omega_2**2
+    )
+
+
+def potential_energy(x, psi=plant.PSI_NOMINAL, xp=np):
+    """Potential energy in J, zero with both rods level, x (6, ...) -> (...)."""
+    _, rod_1, rod_2 = plant.masses(psi)
+    height_1, height_2 = (
+        plant.CENTRE_1 * xp.cos(x[1]),
+        plant.LENGTH_1 * xp.cos(x[1]) + plant.CENTRE_2 * xp.cos(x[2]),
+    )
+    return plant.GRAVITY * (rod_1 * height_1 + rod_2 * height_2)
 
 
 def skeleton(x):
