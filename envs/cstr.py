@@ -42,9 +42,8 @@ EVAL_PSI = grid(np.linspace(1.05, 0.95, 7), np.linspace(1.1, 0.9, 8))  # 8 of th
 
 BENCHMARK = {  # the MPC that the paper compares with: hard bounds but for the upper one of T_R, quadratic cost
     "horizon": 20,
-    "slack_price": np.array(
-        [[np.inf, np.inf, np.inf, np.inf], [np.inf, np.inf, 100.0, np.inf]]
-    ),  # below, above
+    # below, above
+    "slack_price": np.array([[np.inf, np.inf, np.inf, np.inf], [np.inf, np.inf, 100.0, np.inf]]),
     "change_weight": np.array([0.1 / 100**2, 1e-3 / 2000**2]),
 }
 
@@ -52,14 +51,11 @@ GOAL_INDEX = [1]  # the goal is a concentration c_B, mol/l
 TRAIN_GOALS = np.array([[0.6], [0.7], [0.8]])
 EVAL_GOAL = np.array([0.65])
 GOAL_LOW, GOAL_HIGH = np.array([0.1]), np.array([2.0])
-GOAL_REACHABLE = (
-    np.array([0.31]),
-    np.array([0.80]),
-)  # at steady state, inside the box, by every scenario of the "mpc" set
+# at steady state, inside the box, by every scenario of the set "mpc"
+GOAL_REACHABLE = np.array([0.31]), np.array([0.80])
 ERROR_SCALE = np.array([0.05])  # mol/l; five standard deviations of the training reward
-MISMATCH_SCALE = np.array(
-    [0.02, 0.02, 0.5, 0.5]
-)  # mol/l, mol/l, degC, degC: what the corners of the training box do in one step
+# mol/l, mol/l, degC, degC: what the corners of the training box do in one step
+MISMATCH_SCALE = np.array([0.02, 0.02, 0.5, 0.5])
 REWARD_SIGMA2 = 1e-4  # (mol/l)^2, eq:cstrreward
 REWARD_TOLERANCE = 0.01  # mol/l
 MODEL_SUBSTEPS = 4  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8

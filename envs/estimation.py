@@ -42,10 +42,8 @@ class Mismatch:
 
     def step(self, x, u, psi):
         x = np.asarray(x)[..., : len(self.plant.X_LOW)]
-        x_next, nominal = (
-            self.plant.step(x, u, psi),
-            self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi))),
-        )
+        x_next = self.plant.step(x, u, psi)
+        nominal = self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi)))
         return np.concatenate([x_next, np.tanh((x_next - nominal) / self.MISMATCH_SCALE)], axis=-1)
 
 
@@ -65,13 +63,12 @@ class Estimator:
     """
 
     def __init__(self, plant, kind=None, gain=1.0, scale=None, window=5):
-        self.plant, self.kind, self.gain, self.scale, self.window = (
-            plant,
-            kind,
-            gain,
-            np.inf if scale is None else np.array(scale),
-            window,
-        )
+        self.plant, self.kind, self.gain, self.window = plant, kind, gain, window
+        self.scale = np.inf if scale is None else np.array(scale)
+        if kind not in (None, "disturbance", "parameters", "mismatch"):
+            raise ValueError(f"kind is {kind!r}; it must be None, 'disturbance', 'parameters' or 'mismatch'")
+        if not 0 < gain <= 1:
+            raise ValueError(f"gain is {gain}; it must lie in (0, 1]")
         self.reset()
 
     def reset(self):
@@ -132,7 +129,5 @@ class Estimator:
             predicted = self.plant.step(x, u, np.tile(nominal + half * v, (len(x), 1)))
             return np.append((predicted - x_next) / scale, prior * (v - self.shift / known))
 
-        return (
-            half
-            * least_squares(residuals, np.clip(self.shift / known, -1.99, 1.99), bounds=(-2, 2), xtol=1e-6).x
-        )
+        start = np.clip(self.shift / known, -1.99, 1.99)
+        return half * least_squares(residuals, start, bounds=(-2, 2), xtol=1e-6).x

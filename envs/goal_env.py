@@ -109,14 +109,12 @@ class GoalEnv(_PlantSpaces, gym.Env):
         super().reset(seed=seed)
         given, self.t = self._options(options, ()), 0
         self.x = given["state"] if "state" in given else sample_states(self.plant, self.np_random, 1)[0]
-        self.goal = (
-            given["goal"]
-            if "goal" in given
-            else np.array(self.np_random.choice(self.plant.TRAIN_GOALS), dtype=np.float64)
-        )
-        self.psi = (
-            given["psi"] if "psi" in given else self.np_random.choice(self.scenarios) if self.hold else None
-        )
+        self.goal = given.get("goal")
+        if self.goal is None:
+            self.goal = np.array(self.np_random.choice(self.plant.TRAIN_GOALS), dtype=np.float64)
+        self.psi = given.get("psi")
+        if self.psi is None and self.hold:
+            self.psi = self.np_random.choice(self.scenarios)
         return self._obs(self.x, self.goal), {}
 
     def step(self, action):
@@ -157,10 +155,8 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
         )
         self.num_envs, self.branches = num_envs, branches
         self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
-        self.single_observation_space, self.single_action_space = (
-            self._single_observation_space,
-            self._single_action_space,
-        )
+        self.single_observation_space = self._single_observation_space
+        self.single_action_space = self._single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 

@@ -33,9 +33,8 @@ def stepper(ode, dt, substeps=8):
     """The simulated plant: `step(x, u, psi)`, the state one sampling time later with u held, batched over the leading axes, (..., n)."""
 
     def step(x, u, psi, substeps=substeps):
-        x, u, psi = (
-            np.ascontiguousarray(np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)) for a in (x, u, psi)
-        )
+        first = [np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0) for a in (x, u, psi)]
+        x, u, psi = map(np.ascontiguousarray, first)
         return np.moveaxis(rk4(ode, x, u, psi, dt, substeps), 0, -1).copy()
 
     return step
@@ -46,21 +45,8 @@ def grid(*values):
     return np.array(list(itertools.product(*values)), dtype=float)
 
 
-REQUIRED = (
-    "ENV_ID",
-    "DT",
-    "STATE_NAMES",
-    "STATE_UNITS",
-    "X_LOW",
-    "X_HIGH",
-    "ACTION_NAMES",
-    "ACTION_UNITS",
-    "U_LOW",
-    "U_HIGH",
-    "GOAL_INDEX",
-    "TRAIN_GOALS",
-    "EVAL_GOAL",
-)
+REQUIRED = ["ENV_ID", "DT", "STATE_NAMES", "STATE_UNITS", "X_LOW", "X_HIGH", "ACTION_NAMES", "ACTION_UNITS"]
+REQUIRED += ["U_LOW", "U_HIGH", "GOAL_INDEX", "TRAIN_GOALS", "EVAL_GOAL"]
 
 
 class Plant:
@@ -116,12 +102,10 @@ def _defaults(p):
     nominal = given("PSI_NOMINAL", [])
     ends = [given(name, nominal) for name in ("PSI_LOW", "PSI_HIGH")]
     if nominal.size <= 2:
-        robust, evaluated = (grid(*(np.linspace(low, high, n) for low, high in zip(*ends))) for n in (10, 7))
+        robust, evaluated = (grid(*np.linspace(*ends, n).T) for n in (10, 7))
     else:  # a grid would be huge
-        robust, evaluated = (
-            np.random.default_rng(seed).uniform(*ends, size=(n, nominal.size))
-            for seed, n in ((0, 1000), (1, 200))
-        )
+        robust = np.random.default_rng(0).uniform(*ends, size=(1000, nominal.size))
+        evaluated = np.random.default_rng(1).uniform(*ends, size=(200, nominal.size))
     few = grid(*np.transpose([nominal, *ends])) if nominal.size <= 3 else np.stack([nominal, *ends])
     few = np.concatenate([nominal[None], few[(few != nominal).any(axis=1)]])
     sets = {"nominal": nominal[None], "mpc": few, "robust": robust}
@@ -191,12 +175,8 @@ def _defaults(p):
 
 def _check(p, name):
     """Shapes, order and finite numbers of the names that p has."""
-    n_x, n_u, n_goal, n_psi = (
-        len(p.STATE_NAMES),
-        len(p.ACTION_NAMES),
-        len(p.GOAL_INDEX),
-        np.size(getattr(p, "PSI_NOMINAL", [])),
-    )
+    n_x, n_u, n_goal = len(p.STATE_NAMES), len(p.ACTION_NAMES), len(p.GOAL_INDEX)
+    n_psi = np.size(getattr(p, "PSI_NOMINAL", []))
 
     def refuse(sentence):
         raise ValueError(f"envs/{name}.py: {sentence}")
@@ -236,11 +216,7 @@ def _check(p, name):
             or not np.isfinite(value).all()
             and each not in ("X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH")
         ):
-            hint = (
-                "; give INIT_LOW and INIT_HIGH, where episodes start"
-                if each in ("INIT_LOW", "INIT_HIGH")
-                else ""
-            )
+            hint = "; give INIT_LOW and INIT_HIGH, where episodes start" * each.startswith("INIT")
             refuse(f"{each} is {value.tolist()}; it must be finite{hint}")
     for box in ("X", "INIT", "OBS", "U", "GOAL"):
         low, high = (np.asarray(getattr(p, f"{box}_{end}", 0.0), dtype=float) for end in ("LOW", "HIGH"))
@@ -373,9 +349,8 @@ def checked_goal(plant, goal, horizon=None):
     n, goal = len(plant.GOAL_INDEX), np.array(goal, dtype=float)
     goal = goal.reshape(1) if goal.ndim == 0 and n == 1 else goal
     low, high = plant.GOAL_LOW, plant.GOAL_HIGH
-    shown, low_shown, high_shown = (
-        np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high)
-    )
+    texts = [np.array2string(v.ravel(), threshold=4, edgeitems=1) for v in (goal, low, high)]
+    shown, low_shown, high_shown = texts
     if goal.shape not in ((n,), (n, horizon)):
         stages = f", or {n} for each of {horizon} stages" if horizon else ""
         raise ValueError(f"goal is {shown}; {plant.ENV_ID} needs {n} number(s){stages}")

@@ -19,9 +19,8 @@ class Scaling:
     @classmethod
     def of(cls, plant):
         def affine(name, low, high):
-            half = np.where(
-                high > low, (high - low) / 2, 1.0
-            )  # a mismatch starts at zero and has unit scale already
+            # a mismatch starts at zero and has unit scale already
+            half = np.where(high > low, (high - low) / 2, 1.0)
             return {f"{name}_center": ((low + high) / 2).tolist(), f"{name}_scale": half.tolist()}
 
         index, n_x = plant.GOAL_INDEX, len(plant.INIT_LOW)

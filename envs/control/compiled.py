@@ -43,10 +43,8 @@ def compiled(source, *flags, link=("-lm",)):
         raise OSError("no gcc, clang or cc")
     version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
     info = Path("/proc/cpuinfo")
-    processor = (
-        re.search(r"^(flags|Features)\s*:.*", info.read_text(), re.MULTILINE) if info.exists() else None
-    )
-    processor = processor[0] if processor else platform.processor()
+    found = re.search(r"^(flags|Features)\s*:.*", info.read_text() if info.exists() else "", re.MULTILINE)
+    processor = found[0] if found else platform.processor()
     key = hashlib.sha256(
         source.encode() + version + f"{FLAGS} {flags} {link} {processor}".encode()
     ).hexdigest()[:32]

@@ -120,13 +120,9 @@ class GreedyController(ActorController):
     def __init__(self, plant, actor, Q, goal, estimator=None, points=9):
         super().__init__(plant, actor, goal, estimator)
         n_u = len(plant.U_LOW)
-        sizes = (
-            ("v", n_u),
-            ("x", len(plant.X_LOW)),
-            ("goal", len(self.goal)),
-            ("mismatch", len(plant.X_LOW)),
-        )
-        v, *given = (ca.MX.sym(*size) for size in sizes)  # v: action scaled to [0, 1]
+        v = ca.MX.sym("v", n_u)  # action scaled to [0, 1]
+        sizes = {"x": len(plant.X_LOW), "goal": len(self.goal), "mismatch": len(plant.X_LOW)}
+        given = [ca.MX.sym(*size) for size in sizes.items()]
         q = call(Q, given[0], plant.U_LOW + v * (plant.U_HIGH - plant.U_LOW), *given[1:])
         self.negative_q = ca.Function("negative_q", [v, *given], [-q, -ca.gradient(q, v)])
         grid = np.meshgrid(*[np.linspace(0, 1, points)] * min(n_u, 2))

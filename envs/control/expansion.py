@@ -15,9 +15,8 @@ def expansion(critic):
     networks one by one. A critic that does not observe the mismatch ignores it.
     """
     s, actor, n_x = critic.scaling, critic.actor, len(critic.plant.X_LOW)
-    x, goal, mismatch = (
-        ca.MX.sym(*size) for size in (("x", n_x), ("goal", s["goal_center"].size), ("mismatch", n_x))
-    )
+    sizes = {"x": n_x, "goal": s["goal_center"].size, "mismatch": n_x}
+    x, goal, mismatch = (ca.MX.sym(*size) for size in sizes.items())
     z = critic.features(ca.vertcat(x, mismatch) if critic.mismatch_scale else x, goal)
     z_x = ca.densify(ca.jacobian(z, x))
 

@@ -42,9 +42,8 @@ class ScenarioTree:
         self.inner = int(self.first[horizon])
         self.stage = np.repeat(np.arange(horizon + 1), self.nodes)
         self.parent, self.scenario = np.full(len(self.stage), -1), np.zeros(len(self.stage), dtype=int)
-        self.history = np.full(
-            (len(self.stage), max(robust_horizon, 1)), scenarios
-        )  # at each branching; S where none yet
+        # at each branching; S where none yet
+        self.history = np.full((len(self.stage), max(robust_horizon, 1)), scenarios)
         for node in range(1, len(self.stage)):
             t, order = self.stage[node], node - self.first[self.stage[node]]
             branching = t <= robust_horizon
@@ -115,12 +114,8 @@ class TreeQP:
         edges, rows, inner = len(parent) - 1, len(self.row), (tree.inner, n_u)
         shapes = [(edges, n_x * n_x), (edges, n_x * n_u), (edges, n_x), (edges, n_x * n_x), inner, inner]
         shapes += [(edges, rows), (edges, rows), (edges, 2, rows), inner, inner]
-        self.given, self.du, self.cost, self.counted = (
-            list(map(np.zeros, shapes)),
-            np.zeros(inner),
-            ctypes.c_double(),
-            ctypes.c_int(),
-        )
+        self.given, self.du = list(map(np.zeros, shapes)), np.zeros(inner)
+        self.cost, self.counted = ctypes.c_double(), ctypes.c_int()
         self.memory = list(map(pointer, self.given))
         self.found = pointer(self.du), ctypes.byref(self.cost), ctypes.byref(self.counted)
 
@@ -160,26 +155,13 @@ class ConicQP:
     def __init__(self, tree, n_x, n_u, active, changes, plugin="piqp", options=None):
         parent, inner = tree.parent, tree.inner
         edges, self.row, self.iterations = len(parent) - 1, np.flatnonzero(active.any(axis=0)), 0
-        rows, price = len(self.row), (2 * np.flatnonzero(active.any(axis=0)).size, edges)
-        sizes = {
-            "A": (n_x, n_x * edges),
-            "B": (n_x, n_u * edges),
-            "slope": (n_x, edges),
-            "hessian": (n_x, n_x * edges),
-            "price": price,
-            "change": (n_u, inner),
-            "moved": (n_u, inner),
-        }
+        rows = len(self.row)
+        sizes = {"A": (n_x, n_x * edges), "B": (n_x, n_u * edges), "slope": (n_x, edges)}
+        sizes |= {"hessian": (n_x, n_x * edges), "price": (2 * rows, edges)}
+        sizes |= {"change": (n_u, inner), "moved": (n_u, inner)}
         p = {name: ca.MX.sym(name, *size) for name, size in sizes.items()}
-        dx, du, below, above = (
-            ca.MX.sym(name, n, k)
-            for name, n, k in (
-                ("dx", n_x, edges),
-                ("du", n_u, inner),
-                ("below", rows, edges),
-                ("above", rows, edges),
-            )
-        )
+        dx, du = ca.MX.sym("dx", n_x, edges), ca.MX.sym("du", n_u, inner)
+        below, above = ca.MX.sym("below", rows, edges), ca.MX.sym("above", rows, edges)
         f, dynamics = ca.dot(p["price"], ca.vertcat(below, above)) + RIDGE / 2 * ca.sumsqr(du), []
         for e, before in enumerate(parent[1:]):
             A, B, hessian = (
