@@ -24,7 +24,7 @@ import reproduce  # noqa: E402
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text()
-    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 }
 SCRIPTS = {
     "sac_her_branching.py": sac_her_branching,
