@@ -86,7 +86,7 @@ class Args:
     reward_tolerance: float | None = None
     """half-width of the 0/1 reward, units of the goal error; default: the plant's (cstr: 0.01)"""
     constraint_weight: float = 0.0
-    """weight in the reward of time outside constraints, exp(-|x - clip(x)|^2 / 0.02) - 1; 0: the paper's agent"""
+    """weight in the reward of time outside constraints, exp(-|x - clip(x)|^2 / (2 METRIC_SIGMA2)) - 1; 0: the paper"""
     goal_input: Literal["error", "goal"] = "error"
     """what the networks see beside the state: goal minus achieved goal, or the goal itself"""
     add_plant_data: Path | None = None

@@ -32,6 +32,11 @@ def test_a_script_can_be_read_in_a_sitting(name, most):
     assert len(text.splitlines()) <= most and "fmt: skip" not in text and "fmt: off" not in text
 
 
+def test_the_readme_can_be_read_in_minutes():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 180 and len(text.split()) <= 1_800
+
+
 def test_everything_is_formatted():
     ruff = [sys.executable, "-m", "ruff"]
     for command in (["format", "--check"], ["check"]):
