@@ -626,3 +626,24 @@ def test_an_interrupt_ends_the_program_at_once():
     assert "variables" in process.stdout.readline()  # built; the next thing is a solve
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=10) == -signal.SIGINT
+
+
+def test_what_the_caller_hands_over_is_not_kept():
+    """Buffers that are used again change nothing."""
+    x, goal, scenarios = CSTR_X0.copy(), np.array([0.65]), cstr.SCENARIOS["mpc"].copy()
+    price, change = np.full((2, 4), 2.0), np.array([1e-4, 1e-8])
+    stage = gm.costs(cstr, "goal")[0]
+    options = dict(goal=goal, robust_horizon=1, slack_price=price, change_weight=change, compile=False)
+    careless = gm.ScenarioMPC(cstr, 2, scenarios, stage, **options)
+    options = {
+        name: np.copy(value) if isinstance(value, np.ndarray) else value for name, value in options.items()
+    }
+    careful = gm.ScenarioMPC(cstr, 2, scenarios.copy(), stage, **options)
+    for buffer in (goal, scenarios, price, change):
+        buffer[:] = 0.1
+    for _ in range(3):
+        expected = careful.make_step(x.copy())
+        u = careless.make_step(x)
+        np.testing.assert_array_equal(u, expected)
+        u[:] = 0
+        x[:] = cstr.step(x, expected, cstr.PSI_NOMINAL)

@@ -242,3 +242,29 @@ def test_reachable_goals_are_held():
     for name in ("double_pendulum", "linear"):
         with pytest.raises(ValueError, match="one goal"):
             envs.reachable_goals(envs.load(name))
+
+
+def test_an_economic_cost_decides_where_a_goal_is_held(folder, tmp_path):
+    """A double integrator with two inputs, whose goal says nothing about the second state."""
+    import rl_mpc_deploy as deploy
+    import sac_her_branching as training
+
+    two = SMALLEST.replace(
+        '("a",), ("m/s^2",), np.array([-1.0]), np.array([1.0])',
+        '("a", "b"), ("-", "-"), -np.ones(2), np.ones(2)',
+    )
+    two = two.replace("[x[1], u[0] - x[1] - x[0]]", "[u[0] - x[0], u[1] - x[1]]")
+    held = []
+    for name, cost in (("plain", ""), ("economic", "def economic_cost(x, xp=np):\n    return -0.1 * x[1]\n")):
+        args = training.Args(env=folder(name, text=two + cost), hidden=(8,))
+        agent = training.SAC(args, envs.load(name))
+        training.save(training.checkpoint(agent, args, 0), tmp_path / f"{name}.pt")
+        settings = deploy.Args(
+            env=name, critic=tmp_path / f"{name}.pt", horizon=5, compile=False, controllers=("goal_mpc",)
+        )
+        mpc, x = deploy.build_controller("goal_mpc", settings), np.array([0.6, 0.0])
+        for _ in range(40):
+            x = mpc.plant.step(x, mpc.make_step(x), mpc.plant.PSI_NOMINAL)
+        held.append(x)
+    assert np.abs(np.array(held)[:, 0] - 0.7).max() < 0.02
+    assert held[0][1] < 0.5 < 0.9 < held[1][1]
