@@ -27,8 +27,8 @@ from tqdm import tqdm
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-sys.path.insert(0, str(HERE))
-import cells
+sys.path.insert(0, str(ROOT))
+from experiments import common as cells
 
 try:
     import joblib
@@ -49,15 +49,9 @@ class Step:
     """it measures times: nothing else may run"""
 
 
-def experiment(script, study=None, minutes=1.0, needs=(), alone=False):
-    name = f"{script}_{study}" if study else script
-    return Step(
-        name,
-        (f"experiments/{script}.py", *(("--study", study) if study else ())),
-        minutes,
-        tuple(needs),
-        alone,
-    )
+def experiment(name, script, study=None, minutes=1.0, needs=(), alone=False):
+    command = f"experiments/{script}.py", *(("--study", study) if study else ())
+    return Step(f"{name}_{study}" if study else name, command, minutes, tuple(needs), alone)
 
 
 def training(name, *arguments, minutes=1.0):
@@ -71,42 +65,44 @@ STEPS = [
     training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
     training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
     training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
-    experiment("dip_equilibria", minutes=2),
-    experiment("linear_scalability", "main", 15),
-    experiment("linear_scalability", "sweep", 30, ["linear_scalability_main"]),
-    experiment("linear_value_mpc", "train", 70),
-    experiment("linear_value_mpc", "distance", 20, ["linear_value_mpc_train"]),
-    experiment("cstr_training", minutes=25),
-    experiment("cstr_offline", minutes=15),
-    experiment("cstr_offline", "ablation", 40),
-    experiment("cstr_offset_free", "training", 40, ["cstr_offline"]),
-    experiment("cstr_offset_free", "loops", 60, CRITICS),
-    experiment("cstr_tune", minutes=110, needs=CRITICS),
-    experiment("cstr_profile", minutes=1, needs=CRITICS),
-    experiment("cstr_deploy", minutes=60, needs=CRITICS),
-    experiment("cstr_deploy", "critics", 10, CRITICS),
-    experiment("cstr_deploy", "ipopt", 40, CRITICS),
-    experiment("cstr_deploy", "literal", 30, CRITICS),
-    experiment("cstr_deploy", "branching", 5, CRITICS),
-    experiment("cstr_oracle", minutes=90, needs=["cstr_deploy"]),
-    experiment("cstr_frontier", minutes=10, needs=["cstr_oracle"]),
-    experiment("cstr_stuck", minutes=40, needs=CRITICS),
-    experiment("cstr_ablation", minutes=100, needs=["cstr_deploy_critics"]),
-    experiment("cstr_shift", "plants", 50, CRITICS),
-    experiment("cstr_shift", "critic", 4, CRITICS),
-    experiment("reliability", "controllers", 20, CRITICS),
-    experiment("reliability", "training", 10),
-    experiment("reliability", "checkpoints", 2),
-    experiment("reliability", "deployments", 15, CRITICS, alone=True),
-    experiment("reliability", "determinism", 10, CRITICS, alone=True),
-    experiment("dip_performance", minutes=30, alone=True),
-    experiment("linear_value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
-    experiment("linear_value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
-    experiment("solve_time", minutes=10, needs=CRITICS, alone=True),
-    experiment("training_speed", "profile", 1, alone=True),
-    experiment("training_speed", "ablation", 40, ["training_speed_profile"], alone=True),
-    experiment("training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
-    experiment("benchmark_peers", minutes=8, needs=CRITICS, alone=True),
+    experiment("dip_equilibria", "pendulum/equilibria", minutes=2),
+    experiment("linear_scalability", "linear/scalability", "main", 15),
+    experiment("linear_scalability", "linear/scalability", "sweep", 30, ["linear_scalability_main"]),
+    experiment("linear_value_mpc", "linear/value_mpc", "train", 70),
+    experiment("linear_value_mpc", "linear/value_mpc", "distance", 20, ["linear_value_mpc_train"]),
+    experiment("cstr_training", "reactor/training", minutes=25),
+    experiment("cstr_offline", "reactor/offline", minutes=15),
+    experiment("cstr_offline", "reactor/offline", "ablation", 40),
+    experiment("cstr_offset_free", "reactor/offset_free", "training", 40, ["cstr_offline"]),
+    experiment("cstr_offset_free", "reactor/offset_free", "loops", 60, CRITICS),
+    experiment("cstr_tune", "reactor/tune", minutes=110, needs=CRITICS),
+    experiment("cstr_profile", "reactor/trajectories", minutes=1, needs=CRITICS),
+    experiment("cstr_deploy", "reactor/deploy", minutes=60, needs=CRITICS),
+    experiment("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
+    experiment("cstr_deploy", "reactor/deploy", "ipopt", 40, CRITICS),
+    experiment("cstr_deploy", "reactor/deploy", "literal", 30, CRITICS),
+    experiment("cstr_deploy", "reactor/deploy", "branching", 5, CRITICS),
+    experiment("cstr_oracle", "reactor/oracle", minutes=90, needs=["cstr_deploy"]),
+    experiment("cstr_frontier", "reactor/frontier", minutes=10, needs=["cstr_oracle"]),
+    experiment("cstr_stuck", "reactor/stuck", minutes=40, needs=CRITICS),
+    experiment("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
+    experiment("cstr_shift", "reactor/shift", "plants", 50, CRITICS),
+    experiment("cstr_shift", "reactor/shift", "critic", 4, CRITICS),
+    experiment("reliability", "trust/reliability", "controllers", 20, CRITICS),
+    experiment("reliability", "trust/reliability", "training", 10),
+    experiment("reliability", "trust/reliability", "checkpoints", 2),
+    experiment("reliability", "trust/reliability", "deployments", 15, CRITICS, alone=True),
+    experiment("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
+    experiment("dip_performance", "pendulum/performance", minutes=30, alone=True),
+    experiment("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
+    experiment("linear_value_mpc", "linear/value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
+    experiment("solve_time", "speed/solve_time", minutes=10, needs=CRITICS, alone=True),
+    experiment("training_speed", "speed/training_speed", "profile", 1, alone=True),
+    experiment(
+        "training_speed", "speed/training_speed", "ablation", 40, ["training_speed_profile"], alone=True
+    ),
+    experiment("training_speed", "speed/training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
+    experiment("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True),
 ]
 ONE_AT_A_TIME = {"dip_equilibria", "cstr_profile", "solve_time", "benchmark_peers"}  # take no --jobs
 NOTHING_KEPT = {"dip_equilibria", "cstr_profile", "solve_time"}  # take no --runs
@@ -137,12 +133,8 @@ class Args:
 
 def version(quick):
     """Of all code that a step may run, and of the budget."""
-    code = sorted(
-        path
-        for folder in (".", "envs", "envs/control", "envs/agents", "envs/runs", "experiments")
-        for path in (ROOT / folder).iterdir()
-        if path.suffix in (".py", ".c") and path.name != Path(__file__).name
-    )
+    folders = ROOT.glob("*.py"), (ROOT / "envs").rglob("*"), HERE.rglob("*.py")
+    code = sorted(path for found in folders for path in found if path.suffix in (".py", ".c"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in code) + bytes([quick])).hexdigest()[:12]
 
 
@@ -165,14 +157,10 @@ def run(step, args):
         ]
     else:
         command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
-        command += [] if script in ONE_AT_A_TIME else ["--jobs", str(args.step_jobs)]
-        shared = (
-            "cstr_loops"
-            if script.startswith("cstr_")
-            and script not in ("cstr_offline", "cstr_training", "cstr_offset_free")
-            else script
-        )
-        command += [] if script in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
+        command += [] if step.name in ONE_AT_A_TIME else ["--jobs", str(args.step_jobs)]
+        own = not step.name.startswith("cstr_") or script in ("offline", "training", "offset_free")
+        shared = script if own else "cstr_loops"
+        command += [] if step.name in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
     result = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
     )

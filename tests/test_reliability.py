@@ -1,9 +1,8 @@
-"""Faults, hostile files and command lines: what experiments/reliability.py counts, on tiny budgets, and a fuzzer over the arguments."""
+"""Faults, hostile files and command lines: what trust/reliability.py counts, on tiny budgets, and a fuzzer over the arguments."""
 
 import csv
 import dataclasses
 import string
-import sys
 import typing
 from pathlib import Path
 
@@ -16,10 +15,9 @@ from hypothesis import strategies as st
 import goal_mpc
 import rl_mpc_deploy
 import sac_her_branching
+from experiments.trust import reliability
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import reliability  # noqa: E402
 
 SCRIPTS = [goal_mpc, rl_mpc_deploy, sac_her_branching]
 NUMBERS = st.one_of(

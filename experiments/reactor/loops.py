@@ -18,10 +18,7 @@ from unittest import mock
 import numpy as np
 from tqdm import tqdm
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import literal
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 import envs
@@ -29,6 +26,9 @@ import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
 from envs.control.expansion import expansion
+from experiments import common as cells
+from experiments.common import HERE, ROOT
+from experiments.reactor import literal
 
 ROBUST, CONSTRAINED = (HERE / f"pretrained/cstr_{kind}.pt" for kind in ("robust", "constrained"))
 # what rows depend on, read when it is imported: an edit while loops run does not file old results under new code
@@ -228,7 +228,7 @@ def table(rows):
 
 def train(agents, args):
     """Checkpoints of agents (seed, argument, argument, ...) of sac_her_branching.py on the reactor; only missing ones are trained."""
-    code = [HERE.parent / name for name in ("sac_her_branching.py", "envs/__init__.py", "envs/cstr.py")]
+    code = [ROOT / name for name in ("sac_her_branching.py", "envs/__init__.py", "envs/cstr.py")]
 
     def one(agent):
         seed, *flags = map(str, agent)
@@ -242,7 +242,7 @@ def train(agents, args):
         if not (final / "checkpoint.pt").exists():
             command = [
                 sys.executable,
-                str(HERE.parent / "sac_her_branching.py"),
+                str(ROOT / "sac_her_branching.py"),
                 "--seed",
                 seed,
                 "--eval-every",

@@ -1,9 +1,9 @@
 """Figure `cstr_offlineagent`: offset of the robust and of the nominal agent on the nominal plant and on uncertain plants; and
 what the number of scenarios, branches per transition and a critic per scenario do to it.
 
-    python experiments/cstr_offline.py --jobs 2                    # six minutes: 10 training seeds per agent; continues where it stopped
-    python experiments/cstr_offline.py --study ablation --jobs 2   # a quarter of an hour more: 5 seeds per variant
-    python experiments/cstr_offline.py --plot-only                 # redraw from the committed CSV
+    python experiments/reactor/offline.py --jobs 2                    # six minutes: 10 training seeds per agent; continues where it stopped
+    python experiments/reactor/offline.py --study ablation --jobs 2   # a quarter of an hour more: 5 seeds per variant
+    python experiments/reactor/offline.py --plot-only                 # redraw from the committed CSV
 
 The evaluation is the paper's (`sac_her_branching.evaluate`): 200 start states, the same for every agent, 50 steps, goal 0.65 mol/l, mean
 absolute percentage error of c_B over the last 25. Writes results/cstr_offline.csv (a row per agent, seed, evaluation and start) or
@@ -20,23 +20,20 @@ from pathlib import Path
 from typing import Literal
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import sac_her_branching as sac
 from envs import cstr
 from envs.agents.evaluation import evaluate
 from envs.agents.policy import Scaling
+from experiments import common as cells
+from experiments.common import HERE, ROOT
 
 STUDIES = {  # label: arguments of sac_her_branching.py
     "agents": {"robust": {}, "nominal": {"scenarios": "nominal"}},
@@ -197,7 +194,7 @@ def collect(args):
         for label, settings in STUDIES[args.study].items()
         for seed in range(args.seed, args.seed + (2 if args.quick else seeds))
     ]
-    root = HERE.parent
+    root = ROOT
     inputs = [Path(__file__), root / "sac_her_branching.py", root / "envs/__init__.py", root / "envs/cstr.py"]
     return cells.collect(errors, jobs, args.jobs, args.runs, inputs)
 

@@ -1,7 +1,7 @@
 """Figure `dip_performance`: expert, quadratic and goal-conditioned MPC on the double pendulum's swing-up, from ten starts near 0.9 pi.
 
-    python experiments/dip_performance.py               # a quarter of an hour on one core; continues, cell by cell, where it stopped
-    python experiments/dip_performance.py --plot-only   # redraw from the committed CSV
+    python experiments/pendulum/performance.py               # a quarter of an hour on one core; continues, cell by cell, where it stopped
+    python experiments/pendulum/performance.py --plot-only   # redraw from the committed CSV
 
 The first guess is the start state held, as in the authors' scripts, or (guide 75) the simulated closed loop of the same controller with
 N = 75. Writes results/dip_performance.csv (a row per controller and start, columns of goal_mpc.py) and figures/dip_performance.png.
@@ -11,19 +11,15 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import goal_mpc as gm
 from envs import double_pendulum
+from experiments import common as cells
+from experiments.common import HERE
 
 CELLS = [
     (objective, horizon, guide)

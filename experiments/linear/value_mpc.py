@@ -1,10 +1,10 @@
 """Figure `norm_profile`: the learned value in goal-conditioned MPC on ten random linear systems with 32 states, and its fast variant.
 
-    python experiments/linear_value_mpc.py --study train --jobs 2    # forty minutes: an agent per system; continues where it stopped
-    python experiments/linear_value_mpc.py                           # the closed loops; one process, so that solve times mean something
-    python experiments/linear_value_mpc.py --study distance          # how far from the goal the fast variant stays valid
-    python experiments/linear_value_mpc.py --study scaling           # solve time against n and against the horizon
-    python experiments/linear_value_mpc.py --study profile --plot-only
+    python experiments/linear/value_mpc.py --study train --jobs 2    # forty minutes: an agent per system; continues where it stopped
+    python experiments/linear/value_mpc.py                           # the closed loops; one process, so that solve times mean something
+    python experiments/linear/value_mpc.py --study distance          # how far from the goal the fast variant stays valid
+    python experiments/linear/value_mpc.py --study scaling           # solve time against n and against the horizon
+    python experiments/linear/value_mpc.py --study profile --plot-only
 
 The agents are those of `python sac_her_branching.py --env linear --dim 32 --system 0 --seed 0`, and of 1 to 9; the scaling study has one
 more for each smaller n, of 100,000 transitions. Every controller has the stage cost -exp(-|x|^2) at x_1 ... x_N and state bounds 1.5 at a
@@ -29,16 +29,12 @@ from typing import Literal
 
 import casadi as ca
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 import envs
@@ -47,6 +43,8 @@ import rl_mpc_deploy as deploy
 from envs import linear
 from envs.control.expansion import expansion
 from envs.control.tree_qp import positive_part
+from experiments import common as cells
+from experiments.common import HERE, ROOT
 
 CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None for goal_mpc.py)
     "RL (actor alone)": ("#D55E00", "--", dict(controllers=("actor",))),
@@ -104,7 +102,7 @@ def checkpoint(args, dim, system):
     """The trained agent of a system; a missing one is a user's mistake."""
     found = list(agent_folder(args, dim, system).glob("*/wall_seconds.txt"))
     if not found:
-        command = f"python experiments/linear_value_mpc.py --study train --dim {args.dim} --systems {args.systems} --runs {args.runs}"
+        command = f"python experiments/linear/value_mpc.py --study train --dim {args.dim} --systems {args.systems} --runs {args.runs}"
         cells.fail(
             f"no trained agent in {agent_folder(args, dim, system)}; first run {command}{' --quick' if args.quick else ''}"
         )
@@ -115,7 +113,7 @@ def train(args, dim, system):
     """One run of the training script, continued where it was interrupted; returns its row."""
     parent = agent_folder(args, dim, system)
     if not list(parent.glob("*/wall_seconds.txt")):
-        command = [sys.executable, str(HERE.parent / "sac_her_branching.py")]
+        command = [sys.executable, str(ROOT / "sac_her_branching.py")]
         interrupted = list(parent.glob("*/resume.pt"))
         if interrupted:
             command += ["--resume", str(interrupted[0])]

@@ -1,8 +1,8 @@
 """How far each controller of the reactor is from the best possible: one optimal control problem over the whole episode for each draw.
 
-    python experiments/cstr_deploy.py --jobs 2      # first: the controllers, whose trajectories are guesses
-    python experiments/cstr_oracle.py --jobs 2      # twenty minutes; continues where it stopped
-    python experiments/cstr_oracle.py --plot-only   # print the tables from the committed CSV
+    python experiments/reactor/deploy.py --jobs 2      # first: the controllers, whose trajectories are guesses
+    python experiments/reactor/oracle.py --jobs 2      # twenty minutes; continues where it stopped
+    python experiments/reactor/oracle.py --plot-only   # print the tables from the committed CSV
 
 The oracle knows the plant's parameters and the whole episode, and maximises the evaluation's own time near goal minus a slack penalty of 1
 or 5 per mol/l or degC and step (on the first 50 draws 0.3 to 100, for the frontier). The problem has local optima: it is solved from
@@ -26,17 +26,14 @@ import casadi as ca
 import numpy as np
 import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_deploy
-import cstr_loops as loops
-import literal
-from cstr_deploy import summary
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import literal, loops
+from experiments.reactor.deploy import STUDIES, summary
 
 WEIGHTS, FRONTIER = (1.0, 5.0), (0.3, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0)
 FRONTIER_DRAWS = 50
@@ -187,7 +184,7 @@ def best(cell):
 def collect(args):
     """The oracle's rows and those of every controller."""
     episodes, steps = (2, 3) if args.quick else (args.episodes, 100)
-    variants = cstr_deploy.STUDIES["deploy"]
+    variants = STUDIES["deploy"]
     controllers = loops.collect(variants, args)  # found in args.runs if cstr_deploy.py has run
     oracle(steps)  # compiled before the processes fork
     jobs = []
@@ -269,7 +266,7 @@ def main(args):
     cells.check(args, "cstr_oracle.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
     if not (args.out / "results/cstr_deploy.csv").exists():
         cells.fail(
-            f"{args.out / 'results/cstr_deploy.csv'} does not exist; run python experiments/cstr_deploy.py first"
+            f"{args.out / 'results/cstr_deploy.csv'} does not exist; run python experiments/reactor/deploy.py first"
         )
     table, gap_table = (args.out / f"results/{name}.csv" for name in ("cstr_oracle", "cstr_oracle_gap"))
     if not args.plot_only:

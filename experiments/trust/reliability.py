@@ -1,6 +1,6 @@
 """What happens when things go wrong, counted: faults in closed loops, killed trainings, hostile checkpoints, many deployments, two runs.
 
-    python experiments/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
+    python experiments/trust/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
 
 controllers: closed loops over random starts, goals and plants, and the same with a fault at every fourth step: numbers that are not
 finite in the measurement or in the previous plan, states far outside the box, a solver stopped after one iteration (goal_mpc.py: three) or
@@ -35,18 +35,16 @@ import numpy as np
 import torch
 import tyro
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
-sys.path.insert(0, str(ROOT))
-import cells
-import reproduce
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
 from envs.agents.checkpoint import MAX_CHECKPOINT_BYTES
 from envs.control.expansion import torch_value
+from experiments import common as cells
+from experiments import reproduce
+from experiments.common import HERE, ROOT
 
 EPISODE = 25  # steps
 IPOPT = {  # goal_mpc.py's

@@ -1,8 +1,8 @@
 """How each controller of the reactor degrades outside of the training box, and how far the critic can be believed where the planner goes.
 
-    python experiments/cstr_shift.py --jobs 2                    # plants beyond the box; a quarter of an hour, continues where it stopped
-    python experiments/cstr_shift.py --study critic --jobs 2     # calibration of the critics; two minutes
-    python experiments/cstr_shift.py --plot-only                 # redraw from the committed CSV
+    python experiments/reactor/shift.py --jobs 2                    # plants beyond the box; a quarter of an hour, kept
+    python experiments/reactor/shift.py --study critic --jobs 2     # calibration of the critics; two minutes
+    python experiments/reactor/shift.py --plot-only                 # redraw from the committed CSV
 
 plants: (alpha, beta) lie on the edge of the training box [0.95, 1.05] x [0.9, 1.1] blown up by a factor of 0 to 2 about its centre; start
 and direction of a draw are the same at every factor. critic: the learned value at states which RL+MPC and which the actor visit, against
@@ -18,25 +18,22 @@ from pathlib import Path
 from typing import Literal
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import tyro
 from scipy.stats import spearmanr
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-from cstr_deploy import ACTOR, AWARE, MEASURES, PAPER, RL_MPC, TUNED
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
 from envs import cstr
 from envs.agents.policy import Scaling
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops
+from experiments.reactor.deploy import ACTOR, AWARE, MEASURES, PAPER, RL_MPC, TUNED
 
 FACTORS = (0.0, 0.5, 1.0, 1.5, 2.0)
 CONTROLLERS = {  # label: (colour, dashes, keywords of cstr_loops)

@@ -1,13 +1,13 @@
 """Figures `cstr_rlmpc` and `full_cstr_rlmpc`: every controller of the reactor on paired draws of start state and plant.
 
-    python experiments/cstr_deploy.py --jobs 2                   # 200 draws, 50 minutes; continues where it stopped
-    python experiments/cstr_deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
-    python experiments/cstr_deploy.py --study ipopt --jobs 2     # the same problems solved by IPOPT
-    python experiments/cstr_deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours, all by IPOPT
-    python experiments/cstr_deploy.py --study branching --jobs 2 # trees that branch at none, one and two stages
-    python experiments/cstr_deploy.py --plot-only                # redraw from the committed CSV
+    python experiments/reactor/deploy.py --jobs 2                   # 200 draws, 50 minutes; continues where it stopped
+    python experiments/reactor/deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
+    python experiments/reactor/deploy.py --study ipopt --jobs 2     # the same problems solved by IPOPT
+    python experiments/reactor/deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours, all by IPOPT
+    python experiments/reactor/deploy.py --study branching --jobs 2 # trees that branch at none, one and two stages
+    python experiments/reactor/deploy.py --plot-only                # redraw from the committed CSV
 
-Writes results/cstr_deploy.csv (a row per controller and draw), figures/cstr_deploy.png and cstr_deploy_full.png; the other studies write
+Writes results/cstr_deploy.csv (a row per controller and draw), figures/deploy.png and cstr_deploy_full.png; the other studies write
 cstr_STUDY. How far each controller is from the best possible is said by cstr_oracle.py.
 """
 
@@ -16,21 +16,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import seaborn as sns
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-from cstr_tune import TUNED, TUNED_IPOPT
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import rl_mpc_deploy as deploy
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops
+from experiments.reactor.tune import TUNED, TUNED_IPOPT
 
 PAPER, AWARE = dict(critic=loops.ROBUST), dict(critic=loops.CONSTRAINED)
 ACTOR, RL_MPC = dict(controllers=("actor",)), dict(controllers=("rl_mpc",))

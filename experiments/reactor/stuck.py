@@ -1,7 +1,7 @@
 """Why robust MPC stays where it is: one problem under two solvers, each given the other's plan, and IPOPT with other Hessians and barriers.
 
-    python experiments/cstr_stuck.py --jobs 2        # half an hour; continues where it stopped
-    python experiments/cstr_stuck.py --plot-only     # print the table of the committed CSV
+    python experiments/reactor/stuck.py --jobs 2        # half an hour; continues where it stopped
+    python experiments/reactor/stuck.py --plot-only     # print the table of the committed CSV
 
 The problem is that of rl_mpc_deploy.py's robust MPC, N = 20 with quadratic cost, hard bounds as exact penalties; objectives are the same
 number for the same plan. Closed loops on paired draws:
@@ -23,14 +23,12 @@ import casadi as ca
 import numpy as np
 import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-import literal
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import rl_mpc_deploy as deploy
 from envs import cstr
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import literal, loops
 
 PRICE = np.minimum(len(cstr.SCENARIOS["mpc"]) * cstr.BENCHMARK["slack_price"], deploy.HARD_PRICE)
 PROBLEM = dict(

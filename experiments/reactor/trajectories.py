@@ -1,8 +1,8 @@
 """Figure `cstr_rlmpc_profile`: every controller from the paper's start state, where the benchmark MPC gets stuck.
 
-    python experiments/cstr_profile.py              # about a minute
-    python experiments/cstr_profile.py --goal 0.65 --start 0.8 0.3 60 60 --out runs/cold
-    python experiments/cstr_profile.py --plot-only  # redraw from the committed CSV
+    python experiments/reactor/trajectories.py              # about a minute
+    python experiments/reactor/trajectories.py --goal 0.65 --start 0.8 0.3 60 60 --out runs/cold
+    python experiments/reactor/trajectories.py --plot-only  # redraw from the committed CSV
 
 The paper's agent is blind to constraints; the constraint-aware one is the default of rl_mpc_deploy.py, with soft and with hard constraints.
 Writes results/cstr_profile.csv (a row per controller and sampling time) and figures/cstr_profile.png.
@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import rl_mpc_deploy as deploy
 from envs import cstr
 from envs.runs.figure import draw_episode
+from experiments import common as cells
+from experiments.common import HERE
 
 PAPER = dict(critic=HERE / "pretrained/cstr_robust.pt")
 CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, lines)

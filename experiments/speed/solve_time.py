@@ -1,7 +1,7 @@
 """Where the time of a step of the planners goes, and how it grows with the horizon and the number of scenarios.
 
-    python experiments/solve_time.py                    # two minutes in one process, and compilation: nothing else should run
-    python experiments/solve_time.py --plot-only        # redraw from the committed CSV
+    python experiments/speed/solve_time.py                    # two minutes in one process, and compilation: nothing else should run
+    python experiments/speed/solve_time.py --plot-only        # redraw from the committed CSV
 
 `where`: closed loops over the paired draws of rl_mpc_deploy.py, with a clock around every call of a compiled function and of the solver of
 quadratic programs; what remains of make_step is Python. `scaling`: cold solves of RL+MPC from the same start states, in turn, by horizon (9
@@ -18,21 +18,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import literal
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr, double_pendulum
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import literal
 
 CONTROLLERS = {  # label: (name, keywords of rl_mpc_deploy.Args)
     "RL+MPC, N = 1": ("rl_mpc", dict(horizon=1)),

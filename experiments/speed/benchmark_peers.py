@@ -1,7 +1,7 @@
 """Solve times beside the authors' stack, do-mpc with L4CasADi: the same optimal control problems, one core, step by step in turn.
 
-    python experiments/benchmark_peers.py                  # eight minutes, in one process: nothing else should run
-    python experiments/benchmark_peers.py --plot-only      # redraw from the committed CSV
+    python experiments/speed/benchmark_peers.py                  # eight minutes, in one process: nothing else should run
+    python experiments/speed/benchmark_peers.py --plot-only      # redraw from the committed CSV
 
 The peers live in environments of their own (see requirements-peers.txt and requirements-peers-new.txt for how they are made); where one
 is not there, its rows say so and this repository's side is measured alone. Each row is a closed loop of every controller from the same
@@ -28,23 +28,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import literal
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
 from envs.control.expansion import expansion
+from experiments import common as cells
+from experiments.common import HERE, ROOT
+from experiments.reactor import literal
 
 LABELS = {
     "l4casadi": "do-mpc 4.6.5 + L4CasADi, same model",
@@ -82,9 +79,9 @@ CSTR_START = np.array([0.8, 0.4, 134.14, 130.0])  # of the authors' scripts
 
 @dataclass(frozen=True)
 class Args:
-    peers: Path = HERE.parent / ".venv-peers"
+    peers: Path = ROOT / ".venv-peers"
     """virtual environment of requirements-peers.txt"""
-    peers_new: Path = HERE.parent / ".venv-peers-new"
+    peers_new: Path = ROOT / ".venv-peers-new"
     """virtual environment of requirements-peers-new.txt"""
     starts: int = 3
     """start states (with a trained critic: 2 at most; the pendulum: 2 at most)"""
@@ -459,7 +456,7 @@ def main(args):
             todo.append((env, horizon, kind, peer, str(python), starts, steps, args.seed, args.core))
         inputs = [HERE / name for name in ("benchmark_peers.py", "peer_do_mpc.py", "literal.py")]
         inputs += [
-            HERE.parent / name
+            ROOT / name
             for name in (
                 "rl_mpc_deploy.py",
                 "goal_mpc.py",

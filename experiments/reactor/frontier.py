@@ -1,8 +1,8 @@
 """Time near goal against time outside constraints: what every controller of the reactor trades, and what is possible.
 
-    python experiments/cstr_deploy.py --jobs 2 && python experiments/cstr_oracle.py --jobs 2   # first: points, and the oracle's curve
-    python experiments/cstr_frontier.py --jobs 2      # a quarter of an hour; continues where it stopped
-    python experiments/cstr_frontier.py --plot-only   # redraw from the committed CSVs
+    python experiments/reactor/deploy.py --jobs 2 && python experiments/reactor/oracle.py --jobs 2   # first: points, and the oracle's curve
+    python experiments/reactor/frontier.py --jobs 2      # a quarter of an hour; continues where it stopped
+    python experiments/reactor/frontier.py --plot-only   # redraw from the committed CSVs
 
 RL+MPC's slack weight is swept, which is its weight between value and constraints, at N = 1, 5 and 10 with the constraint-aware critic and
 at N = 5 with the paper's, on the draws of cstr_deploy.py. Writes results/cstr_frontier.csv (a row per setting and draw) and
@@ -13,17 +13,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-from cstr_deploy import AWARE, PAPER, RL_MPC, summary
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops
+from experiments.reactor.deploy import AWARE, PAPER, RL_MPC, summary
 
 WEIGHTS = (0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
 CURVES = {  # label: (colour, marker, keywords of cstr_loops)

@@ -1,6 +1,6 @@
 """The robust benchmark MPC with its weights tuned, under both solvers, so that RL+MPC is not compared with a straw man.
 
-    python experiments/cstr_tune.py --jobs 2        # three quarters of an hour; continues where it stopped
+    python experiments/reactor/tune.py --jobs 2        # three quarters of an hour; continues where it stopped
 
 A grid over the prices of soft constraints (every bound soft, where the published benchmark has hard ones), the penalty of input changes and
 the horizon, on draws of their own, by the planner of rl_mpc_deploy.py and by IPOPT. The best of each, by the sum of the paper's two
@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from envs import cstr
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops
 
 # per mol/l and per degC, summed over scenarios as the published ones
 PRICES = ((0.01, 1.0), (0.03, 1.0), (0.1, 1.0), (1.0, 1.0), (10.0, 10.0))

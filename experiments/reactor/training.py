@@ -2,8 +2,8 @@
 
 Runs sac_her_branching.py, with its default arguments, once per seed and scenario set, each in a process of its own.
 
-    python experiments/cstr_training.py --seeds 10 --jobs 2     # about 15 minutes on two cores; continues where it stopped
-    python experiments/cstr_training.py --plot-only             # redraw from the committed CSV
+    python experiments/reactor/training.py --seeds 10 --jobs 2     # about 15 minutes on two cores; continues where it stopped
+    python experiments/reactor/training.py --plot-only             # redraw from the committed CSV
 
 Writes results/cstr_training.csv (an evaluation per row), results/cstr_training_seeds.csv (a run per row, with wall time and
 machine) and figures/cstr_training.png.
@@ -19,16 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from scipy.stats import trim_mean
 from tqdm import tqdm
 
-matplotlib.use("Agg")
-import cells
-import matplotlib.pyplot as plt
+from experiments import common as cells
+from experiments.common import HERE, ROOT
 
-HERE = Path(__file__).parent
 COLOURS = {"robust": "#0072B2", "nominal": "#E69F00"}  # Okabe and Ito
 
 
@@ -58,7 +57,7 @@ def train(scenarios, seed, args):
         return done[0].parent
     command = [
         sys.executable,
-        str(HERE.parent / "sac_her_branching.py"),
+        str(ROOT / "sac_her_branching.py"),
         "--scenarios",
         scenarios,
         "--seed",

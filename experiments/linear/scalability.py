@@ -1,8 +1,8 @@
 """Figure `scalability`: linear-quadratic against goal-conditioned MPC on random linear systems, and eq:jensen that explains the gap.
 
-    python experiments/linear_scalability.py --jobs 2                  # 50 systems, 10 starts each; continues where it stopped
-    python experiments/linear_scalability.py --study sweep --jobs 2    # what the paper leaves open, one choice at a time
-    python experiments/linear_scalability.py --plot-only               # redraw from the committed CSV
+    python experiments/linear/scalability.py --jobs 2                  # 50 systems, 10 starts each; continues where it stopped
+    python experiments/linear/scalability.py --study sweep --jobs 2    # what the paper leaves open, one choice at a time
+    python experiments/linear/scalability.py --plot-only               # redraw from the committed CSV
 
 Both controllers are goal_mpc.py's, with stage cost l = |x|^2 + |u|^2, terminal cost V = x'Px and the same price on violations of the state
 bounds: one minimises sum l + V, the other sum -exp(-l) - exp(-V). Choices that the paper leaves open: horizon 10, no discount, free
@@ -18,21 +18,17 @@ from pathlib import Path
 from typing import Literal
 
 import casadi as ca
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 from scipy.special import logsumexp
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import goal_mpc as gm
 from envs import linear
+from experiments import common as cells
+from experiments.common import HERE
 
 DIMENSIONS = (2, 4, 8, 16, 32)
 CONTROLLERS = {"quadratic": "LQ-MPC", "goal": "goal-conditioned MPC"}

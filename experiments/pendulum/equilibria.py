@@ -1,7 +1,7 @@
 """Figure `dip_profile`: the goal-conditioned controller visits the double pendulum's three unstable equilibria (sigma^2 = 0.5, N = 35).
 
-    python experiments/dip_equilibria.py               # a minute; the controller learns of each new goal when it is due
-    python experiments/dip_equilibria.py --plot-only   # redraw the profile from the committed CSV (the animation needs the run)
+    python experiments/pendulum/equilibria.py               # a minute; the controller learns of each new goal when it is due
+    python experiments/pendulum/equilibria.py --plot-only   # redraw the profile from the committed CSV (the animation needs the run)
 
 Writes results/dip_equilibria.csv (a row per start and goal), results/dip_profile.csv (the trajectory from the first start),
 figures/dip_profile.png and figures/dip_profile.gif.
@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import goal_mpc as gm
 from envs import double_pendulum as plant
 from envs.runs.figure import draw_episode
+from experiments import common as cells
+from experiments.common import HERE
 
 
 @dataclass

@@ -1,8 +1,8 @@
 """Steady-state offset on plants whose parameters are fixed but unknown: every controller with and without an estimate of its plant.
 
-    python experiments/cstr_offset_free.py --study training --jobs 2   # half an hour: agents that observe the mismatch, and ablations
-    python experiments/cstr_offset_free.py --jobs 2                    # half an hour: closed loops; both continue where they stopped
-    python experiments/cstr_offset_free.py --plot-only                 # redraw from the committed CSV
+    python experiments/reactor/offset_free.py --study training --jobs 2   # half an hour: agents that observe the mismatch, and ablations
+    python experiments/reactor/offset_free.py --jobs 2                    # half an hour: closed loops; both continue where they stopped
+    python experiments/reactor/offset_free.py --plot-only                 # redraw from the committed CSV
 
 loops: the paired draws of cstr_deploy.py on a fixed plant; plants at twice the training box; the catalyst's activity beta falling from 1.0
 to 0.9 at half time, or drifting there; measurement noise, a share of each state's range, under three filter gains. Every measure is of the
@@ -17,23 +17,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-import cstr_offline
-from cstr_deploy import ACTOR, AWARE, PAPER, RL_MPC, TUNED
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops, offline
+from experiments.reactor.deploy import ACTOR, AWARE, PAPER, RL_MPC, TUNED
 
 OBSERVING = dict(observe_mismatch=True, scenario_hold="episode")
 VARIANTS = {  # of the training: (arguments of sac_her_branching.py, mismatch scale times the default, seeds)
@@ -185,7 +180,7 @@ def train(cell):
     scale = cstr.MISMATCH_SCALE
     cstr.MISMATCH_SCALE = factor * scale
     try:
-        return [training_row(label, seed, cstr_offline.errors((label, settings, seed, quick)))]
+        return [training_row(label, seed, offline.errors((label, settings, seed, quick)))]
     finally:
         cstr.MISMATCH_SCALE = scale
 
@@ -322,7 +317,7 @@ def plot_training(rows, path):
     for position, label in enumerate(labels):
         mine = [row for row in rows if row["variant"] == label]
         text = "".join(
-            f"{cstr_offline.line(number(mine, key)):42s}"
+            f"{offline.line(number(mine, key)):42s}"
             for key in ("robust_median_ape", "robust_p75_ape", "nominal_median_ape")
         )
         print(f"{label:40s}{text}")
@@ -371,8 +366,8 @@ def main(args):
             ]
             code = [
                 Path(__file__),
-                cstr_offline.__file__,
-                cstr_offline.sac.__file__,
+                offline.__file__,
+                offline.sac.__file__,
                 envs.__file__,
                 cstr.__file__,
             ]

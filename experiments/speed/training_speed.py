@@ -1,9 +1,9 @@
 """Where the training time of the CSTR agent goes, what its settings buy, and Stable-Baselines3's SAC + HER on the same environment.
 
-    python experiments/training_speed.py --study ablation --jobs 2    # half an hour: one setting changed at a time, 5 seeds
-    python experiments/training_speed.py --study peer --jobs 2        # an hour: Stable-Baselines3 (requirements-dev.txt), 3 seeds
-    python experiments/training_speed.py --study profile              # a minute: the parts of one update; nothing else should run
-    python experiments/training_speed.py --study ablation --plot-only
+    python experiments/speed/training_speed.py --study ablation --jobs 2    # half an hour: one setting changed at a time, 5 seeds
+    python experiments/speed/training_speed.py --study peer --jobs 2        # an hour: Stable-Baselines3 (requirements-dev.txt), 3 seeds
+    python experiments/speed/training_speed.py --study profile              # a minute: the parts of one update; nothing else should run
+    python experiments/speed/training_speed.py --study ablation --plot-only
 
 Runs are told apart by variant and seed and kept, so that a second call continues. Times are of training alone, evaluations left out, one
 thread per run. Writes results/training_speed_NAME.csv for NAME in ablation, peer, profile (ablation and peer: a row per evaluation) and
@@ -19,25 +19,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn as nn
 import tyro
 from scipy.stats import trim_mean
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import sac_her_branching as sac
 from envs import cstr
 from envs.agents.evaluation import evaluation_row
 from envs.agents.policy import Scaling
+from experiments import common as cells
+from experiments.common import HERE, ROOT
 
 VARIANTS = {  # of the arguments of sac_her_branching.py
     "default": [],
@@ -87,7 +83,7 @@ def ours(cell):
     with tempfile.TemporaryDirectory() as folder:
         command = [
             sys.executable,
-            str(HERE.parent / "sac_her_branching.py"),
+            str(ROOT / "sac_her_branching.py"),
             "--seed",
             str(seed),
             "--save-every",
@@ -378,9 +374,9 @@ def main(args):
         seeds = 1 if args.quick else args.seeds if args.study == "ablation" else min(args.seeds, 3)
         todo = [(variant, args.seed + i, args.quick) for i in range(seeds) for variant in variants]
         inputs = [
-            HERE.parent / "sac_her_branching.py",
-            HERE.parent / "envs/__init__.py",
-            HERE.parent / "envs/cstr.py",
+            ROOT / "sac_her_branching.py",
+            ROOT / "envs/__init__.py",
+            ROOT / "envs/cstr.py",
         ]
         rows = cells.collect(ours if args.study == "ablation" else peer, todo, args.jobs, args.runs, inputs)
         rows.sort(key=lambda row: (variants.index(row["variant"]), int(row["seed"])))

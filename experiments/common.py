@@ -16,7 +16,9 @@ import numpy as np
 from scipy.stats import bootstrap, trim_mean
 from tqdm import tqdm
 
-SHARED = Path(__file__).resolve().parent.parent / "envs"
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+SHARED = ROOT / "envs"
 
 
 def fail(message):

@@ -1,7 +1,7 @@
 """What makes RL+MPC good on the reactor: one setting changed at a time, over three critics.
 
-    python experiments/cstr_ablation.py --jobs 2       # forty minutes, training included; continues where it stopped
-    python experiments/cstr_ablation.py --plot-only    # redraw from the committed CSV
+    python experiments/reactor/ablation.py --jobs 2       # forty minutes, training included; continues where it stopped
+    python experiments/reactor/ablation.py --plot-only    # redraw from the committed CSV
 
 The default is `sac_her_branching.py --constraint-weight 3` and `rl_mpc_deploy.py --horizon 5`, slack weight 2. Settings of the training
 have agents of their own, of the same three seeds, none of which is the shipped critic's. "plant data" trains with the closed loops of the
@@ -15,18 +15,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-from cstr_deploy import KINDS, MEASURES, RL_MPC
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from experiments import common as cells
+from experiments.common import HERE
+from experiments.reactor import loops
+from experiments.reactor.deploy import KINDS, MEASURES, RL_MPC
 
 AWARE = KINDS["constraint-aware"]
 PLANT_DATA = "plant data"
