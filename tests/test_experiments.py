@@ -105,11 +105,9 @@ def test_what_is_finished_is_not_repeated(quick):
     assert f"{len(reproduce.STEPS)} steps done" in run(
         "reproduce", "--quick", "--out", quick, "--runs", quick / "runs"
     )
-    for name, study, folder in (
-        ("reactor/deploy", "deploy", "cstr_loops"),
-        ("linear/value_mpc", "train", "value_mpc"),
-    ):
-        run(name, "--study", study, "--quick", "--jobs", 1, "--out", quick, "--runs", quick / "runs" / folder)
+    for name, study in (("reactor/deploy", "deploy"), ("linear/value_mpc", "train")):
+        kept = quick / "runs/experiments"
+        run(name, "--study", study, "--quick", "--jobs", 1, "--out", quick, "--runs", kept)
     assert before == written()
 
 

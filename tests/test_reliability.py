@@ -109,14 +109,14 @@ def test_any_file_is_a_checkpoint_or_refused_in_one_sentence(data, checkpoint, t
         where[data.draw(st.sampled_from(sorted(where)))] = data.draw(plain)
         torch.save(content, path)
     for load in reliability.LOADERS:
-        assert not reliability.read(load, path)["wrong"]
+        assert not reliability.verdict(load, path)["wrong"]
 
 
 def test_code_in_a_checkpoint_is_not_run(capsys, checkpoint, tmp_path):
     data = torch.load(checkpoint, weights_only=True) | {"actor": reliability.Code()}
     torch.save(data, tmp_path / "evil.pt")
     for load in reliability.LOADERS:
-        assert reliability.read(load, tmp_path / "evil.pt") == {"refused": 1}
+        assert reliability.verdict(load, tmp_path / "evil.pt") == {"refused": 1}
     with pytest.raises(ValueError, match="resume.pt"):
         sac_her_branching.main(sac_her_branching.Args(resume=tmp_path / "evil.pt"))
     assert reliability.Code().__reduce__()[1][0] not in capsys.readouterr().out

@@ -18,37 +18,26 @@ from pathlib import Path
 from typing import Literal
 
 import casadi as ca
-import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from scipy.special import logsumexp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import goal_mpc as gm
 from envs import linear
-from experiments import common as cells
-from experiments.common import HERE
+from experiments import common
+from experiments.common import column, distinct, rounded
+from experiments.palette import BLUE, RED
 
 DIMENSIONS = (2, 4, 8, 16, 32)
-CONTROLLERS = {"quadratic": "LQ-MPC", "goal": "goal-conditioned MPC"}
-COLOURS = {"quadratic": "#D55E00", "goal": "#0072B2"}  # Okabe and Ito
-MARKERS = {"quadratic": "s", "goal": "o"}
+CONTROLLERS = {"quadratic": ("LQ-MPC", RED, "s"), "goal": ("goal-conditioned MPC", BLUE, "o")}
 MEASURES = {
     "steps_not_near": "steps not near\nthe origin",
     "l2_error": "$\\ell^2$ error",
     "constraint_violation": "constraint\nviolation",
 }
-BASE = dict(
-    horizon=10,
-    control_horizon=None,
-    gamma=1.0,
-    steps=50,
-    bound=linear.STATE_BOUND,
-    price=1.0,
-    off_diagonal=1.0,
-    entries="symmetric",
-)
+BASE = dict(horizon=10, control_horizon=None, gamma=1.0, steps=50, bound=linear.STATE_BOUND, price=1.0)
+BASE |= dict(off_diagonal=1.0, entries="symmetric")
 SWEEP = {  # one choice at a time
     "base": {},
     "horizon 5": dict(horizon=5),
@@ -68,25 +57,13 @@ SWEEP = {  # one choice at a time
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(common.ParallelArgs):
     study: Literal["main", "sweep"] = "main"
     """main: the figure of the paper; sweep: n = 2, 8, 32 with one open choice changed at a time"""
     systems: int | None = None
-    """random systems per dimension; default: 10, in the sweep 5"""
+    """random systems per dimension, of seeds in a row; default: 10, in the sweep 5"""
     starts: int | None = None
     """initial states per system; default: 10, in the sweep 4"""
-    seed: int = 0
-    """seed of the first system"""
-    jobs: int = 2
-    """processes"""
-    quick: bool = False
-    """2 small systems, 2 starts of 10 steps: a smoke test"""
-    plot_only: bool = False
-    """redraw the figure from the CSV"""
-    runs: Path = Path("runs/linear_scalability")
-    """where finished systems are kept, so that a second call continues"""
-    out: Path = HERE
-    """folder whose results/ and figures/ are written"""
 
 
 def jensen(costs, gamma=1.0):
@@ -122,13 +99,11 @@ class LinearMPC(gm.ScenarioMPC):
         self.gamma, self.control_horizon = gamma, control_horizon
         x, goal = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
         value = plant.lq_value(x, goal, gamma)
-        terminal = ca.Function(
-            "terminal", [x, goal], [-ca.exp(-value) if objective == "goal" else value], {"never_inline": True}
-        )
+        value = -ca.exp(-value) if objective == "goal" else value
+        stage, _ = gm.costs(plant, objective)
+        terminal = ca.Function("terminal", [x, goal], [value], {"never_inline": True})
         options = dict(goal=plant.EVAL_GOAL, compile=False) | options
-        super().__init__(
-            plant, horizon, plant.SCENARIOS["nominal"], gm.costs(plant, objective)[0], terminal, **options
-        )
+        super().__init__(plant, horizon, plant.SCENARIOS["nominal"], stage, terminal, **options)
 
     def weights(self):
         return super().weights() * self.gamma**self.tree.stage
@@ -137,31 +112,22 @@ class LinearMPC(gm.ScenarioMPC):
         problem, limits = super().build_problem(*costs)
         if self.control_horizon is not None:
             n, N = self.plant.A.shape[0], self.horizon
-            x, u = (
-                ca.reshape(problem["x"][at.ravel("F").tolist()], n, N) for at in (self.at["x"], self.at["u"])
-            )
+            x, u = (ca.reshape(problem["x"][self.at[k].ravel("F").tolist()], n, N) for k in "xu")
             x = ca.horzcat(problem["p"][:n], x * self.x_scale + self.x_center)
             goal = ca.reshape(problem["p"][2 * n :], n, N)
-            law = [
-                self.plant.feedback(x[:, t], goal[:, t], self.gamma) for t in range(self.control_horizon, N)
-            ]
-            follows = ca.veccat(
-                *(
-                    u[:, N - len(law) + i] - (action - self.u_center) / self.u_scale
-                    for i, action in enumerate(law)
-                )
-            )
+            follows = []
+            for t in range(self.control_horizon, N):
+                action = self.plant.feedback(x[:, t], goal[:, t], self.gamma)
+                follows.append(u[:, t] - (action - self.u_center) / self.u_scale)
+            follows = ca.veccat(*follows)
             problem["g"] = ca.vertcat(problem["g"], follows)
             limits |= {name: np.append(limits[name], np.zeros(follows.numel())) for name in ("lbg", "ubg")}
         return problem, limits
 
     def build_shift(self):
         w, known = super().build_shift()[0], self.at["x"].size + self.at["slack"].size
-        return (
-            w,
-            w,
-            np.append(w[:known], np.arange(known, len(self.limits["lbg"]))),
-        )  # the law's multipliers stay where they are
+        law = np.arange(known, len(self.limits["lbg"]))  # whose multipliers stay where they are
+        return w, w, np.append(w[:known], law)
 
 
 def controller(plant, objective, settings):
@@ -185,277 +151,204 @@ def judged_plan(mpc, x0, price):
     return right, -weights.sum() * np.exp(right) + price * (weights[1:] * outside).sum()
 
 
+def compared_plans(lq, mpc, states, price):
+    """At every state of a closed loop: is the goal-conditioned plan as good as LQ-MPC's, by the right side and by its objective?"""
+    lq.reset()
+    mpc.reset()
+    compared, worse, costlier = 0, 0, 0
+    for x in states:
+        for rival in (lq, mpc):
+            rival.make_step(x)
+        if all(rival.stats["rung"] in ("solved", "retry") for rival in (lq, mpc)):
+            (lq_side, lq_cost), (side, cost) = (judged_plan(rival, x, price) for rival in (lq, mpc))
+            compared += 1
+            worse += side < lq_side - 1e-6
+            costlier += cost > lq_cost + 1e-6
+    return {"plans_compared": compared, "plans_worse": worse, "plans_costlier": costlier}
+
+
 def run_system(cell):
     """Both controllers from every start of one system: rows of the table."""
     variant, settings, n, system, starts = cell
     settings = dict(settings)
     plant, steps, gamma = make_plant(n, system, settings), settings["steps"], settings["gamma"]
     both = {objective: controller(plant, objective, settings) for objective in CONTROLLERS}
-    rows = []
+    weights, rows = gamma ** np.arange(steps + 1), []
     for start in range(starts):
         x0 = envs.sample_states(plant, np.random.default_rng([n, system, start + 1]), 1)[0]
         for objective, mpc in both.items():
             x, u, _, log = gm.simulate(mpc, x0, plant.PSI_NOMINAL, np.zeros((steps, n)))
-            compared, worse, costlier = 0, 0, 0
-            if (
-                objective == "goal"
-            ):  # at every state of its closed loop: is its plan at least as good, by the right side, as LQ-MPC's?
-                both["quadratic"].reset()
-                mpc.reset()
-                for state in x[:-1]:
-                    rivals = both["quadratic"], mpc
-                    for rival in rivals:
-                        rival.make_step(state)
-                    if all(rival.stats["rung"] in ("solved", "retry") for rival in rivals):
-                        (lq_side, lq_cost), (side, cost) = (
-                            judged_plan(rival, state, settings["price"]) for rival in rivals
-                        )
-                        compared, worse, costlier = (
-                            compared + 1,
-                            worse + (side < lq_side - 1e-6),
-                            costlier + (cost > lq_cost + 1e-6),
-                        )
+            plans = dict.fromkeys(("plans_compared", "plans_worse", "plans_costlier"), 0)
+            if objective == "goal":
+                plans = compared_plans(both["quadratic"], mpc, x[:-1], settings["price"])
             left, right = jensen(trajectory_costs(plant, x, u, gamma), gamma)
-            weights = gamma ** np.arange(steps + 1)
-            distance = np.linalg.norm(x, axis=1)
-            rows.append(
-                {
-                    "variant": variant,
-                    "controller": objective,
-                    "n": n,
-                    "system": system,
-                    "start": start,
-                    "steps_not_near": steps - envs.time_near_goal(plant, x[1:], plant.EVAL_GOAL),
-                    "l2_error": np.sqrt((x[1:] ** 2).sum()),
-                    "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
-                    "jensen_log_left": left,
-                    "jensen_log_right": right,
-                    "log_indicator": np.log((weights * (distance <= 0.1)).sum() / weights.sum() + 1e-300),
-                    "plans_compared": compared,
-                    "plans_worse": worse,
-                    "plans_costlier": costlier,
-                    "solver_failures": sum(not s["success"] for s in log),
-                    "solve_ms_median": np.median([s["wall_ms"] for s in log]),
-                    "condition_L": np.linalg.cond(plant.transform),
-                    "norm_A": np.linalg.norm(plant.A, 2),
-                    "spectral_radius": np.abs(np.linalg.eigvals(plant.A)).max(),
-                }
-            )
-    return [{k: round(float(v), 6) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+            near = (weights * (np.linalg.norm(x, axis=1) <= 0.1)).sum() / weights.sum()
+            row = {"variant": variant, "controller": objective, "n": n, "system": system, "start": start}
+            row |= {
+                "steps_not_near": steps - envs.time_near_goal(plant, x[1:], plant.EVAL_GOAL),
+                "l2_error": np.sqrt((x[1:] ** 2).sum()),
+                "constraint_violation": np.abs(x[1:] - np.clip(x[1:], plant.X_LOW, plant.X_HIGH)).sum(),
+                "jensen_log_left": left,
+                "jensen_log_right": right,
+                "log_indicator": np.log(near + 1e-300),
+            }
+            row |= plans | {
+                "solver_failures": sum(not s["success"] for s in log),
+                "solve_ms_median": np.median([s["wall_ms"] for s in log]),
+                "condition_L": np.linalg.cond(plant.transform),
+                "norm_A": np.linalg.norm(plant.A, 2),
+                "spectral_radius": np.abs(np.linalg.eigvals(plant.A)).max(),
+            }
+            rows.append(rounded(row, 6))
+    return rows
 
 
 def settings_of(args):
     """Variants, dimensions, systems and starts of a study."""
+    swept = args.study == "sweep"
     if args.quick:
-        variants = (
-            {"base": {}}
-            if args.study == "main"
-            else {"base": {}, "control horizon 5": SWEEP["control horizon 5"]}
-        )
-        return variants, (2, 4), 2, 2
-    variants, dimensions, systems, starts = (
-        ({"base": {}}, DIMENSIONS, 10, 10) if args.study == "main" else (SWEEP, (2, 8, 32), 5, 4)
-    )
-    return (
-        variants,
-        dimensions,
-        systems if args.systems is None else args.systems,
-        starts if args.starts is None else args.starts,
-    )
+        return {name: SWEEP[name] for name in ("base", "control horizon 5")[: 1 + swept]}, (2, 4), 2, 2
+    systems, starts = args.systems or (5 if swept else 10), args.starts or (4 if swept else 10)
+    return SWEEP if swept else {"base": {}}, (2, 8, 32) if swept else DIMENSIONS, systems, starts
 
 
 def collect(args):
     variants, dimensions, systems, starts = settings_of(args)
+    few = {"steps": 10} if args.quick else {}
     work = [
-        (variant, tuple((BASE | change | ({"steps": 10} if args.quick else {})).items()), n, system, starts)
+        (variant, tuple((BASE | change | few).items()), n, system, starts)
         for n in reversed(dimensions)  # the long ones first
         for variant, change in variants.items()
         for system in range(args.seed, args.seed + systems)
     ]
-    rows = cells.collect(
-        run_system, work, args.jobs, args.runs, [__file__, gm.__file__, envs.__file__, linear.__file__]
-    )
-    order = {variant: i for i, variant in enumerate(variants)}
-    rows.sort(key=lambda row: (order[row["variant"]], int(row["n"]), int(row["system"]), int(row["start"])))
-    cells.write(rows, args.out / f"results/linear_scalability{'' if args.study == 'main' else '_sweep'}.csv")
+    rows, order = common.collect(run_system, work, args.runs, args.jobs), list(variants)
+    keys = ("n", "system", "start")
+    return sorted(rows, key=lambda row: (order.index(row["variant"]), *(int(row[key]) for key in keys)))
 
 
-def column(rows, key, **where):
-    return np.array([float(row[key]) for row in rows if all(row[k] == str(v) for k, v in where.items())])
+def draw_bands(ax, dimensions, values, colour, style, label):
+    """Median and band of 2.5 to 95 percentile; values: an array for each dimension."""
+    low, median, high = np.transpose([np.quantile(v, [0.025, 0.5, 0.95]) for v in values])
+    ax.plot(dimensions, median, style, color=colour, lw=2, label=label)
+    ax.fill_between(dimensions, low, high, color=colour, alpha=0.2, lw=0)
 
 
-def save(fig, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
+def by_dimension(ax, dimensions):
+    ax.set_xscale("log", base=2)
+    ax.set_xticks(dimensions, dimensions)
 
 
-def plot_main(args):
-    rows = cells.read(args.out / "results/linear_scalability.csv")
+def plot_main(rows, path):
     dimensions = sorted({int(row["n"]) for row in rows})
-    fig, axes = plt.subplots(3, 1, figsize=(7, 6.4), sharex=True, layout="constrained")
-    print(
-        f"{'n':>3s}  {'':22s}{'steps not near':>24s}{'l2 error':>24s}{'violation':>24s}{'failed':>8s}   median [2.5 %, 95 %]"
-    )
-    for objective, colour in COLOURS.items():
+    fig, axes = common.subplots(3, 1, figsize=(7, 6.4), sharex=True)
+    for objective, (name, colour, marker) in CONTROLLERS.items():
         for ax, key in zip(axes, MEASURES):
-            bands = np.array(
-                [
-                    np.quantile(column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95])
-                    for n in dimensions
-                ]
-            )
-            ax.plot(
-                dimensions,
-                bands[:, 1],
-                "-" + MARKERS[objective],
-                color=colour,
-                lw=2,
-                label=CONTROLLERS[objective],
-            )
-            ax.fill_between(dimensions, bands[:, 0], bands[:, 2], color=colour, alpha=0.2, lw=0)
-    for n in dimensions:
-        for objective, name in CONTROLLERS.items():
-            line = ""
-            for key in MEASURES:
-                low, median, high = np.quantile(
-                    column(rows, key, controller=objective, n=n), [0.025, 0.5, 0.95]
-                )
-                line += f"{median:9.2f} [{low:5.2f}, {high:5.2f}]"
-            print(
-                f"{n:3d}  {name:22s}{line}{column(rows, 'solver_failures', controller=objective, n=n).sum():8.0f}"
-            )
-        lq, goal = (
-            column(rows, "steps_not_near", controller=objective, n=n) for objective in CONTROLLERS
-        )  # paired by system and start
-        print(
-            f"     the same start: {np.median(lq - goal):.2f} fewer steps (median), fewer in {(goal < lq).mean():.0%}"
-        )
+            values = [column(rows, key, controller=objective, n=n) for n in dimensions]
+            draw_bands(ax, dimensions, values, colour, "-" + marker, name)
     for ax, label in zip(axes, MEASURES.values()):
         ax.set_ylabel(label)
         ax.set_ylim(bottom=0)
         ax.grid(alpha=0.3)
-    axes[-1].set_xscale("log", base=2)
-    axes[-1].set_xticks(dimensions, dimensions)
+    by_dimension(axes[-1], dimensions)
     axes[-1].set_xlabel("number of states n")
     axes[0].legend(frameon=False)
-    systems, starts = (len({row[key] for row in rows}) for key in ("system", "start"))
-    axes[0].set_title(
-        f"{systems} systems per point, {starts} starts each; band: 2.5 to 95 percentile", fontsize=10
-    )
-    save(fig, args.out / "figures/linear_scalability.png")
+    systems, starts = (len(distinct(rows, key)) for key in ("system", "start"))
+    title = f"{systems} systems per point, {starts} starts each; band: 2.5 to 95 percentile"
+    axes[0].set_title(title, fontsize=10)
+    common.save(fig, path)
 
-    fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    print(
-        "\neq:jensen on the closed loops, logarithms, medians: left side, right side, smallest margin, indicator sum (|x| <= 0.1)"
-    )
-    for objective, colour in COLOURS.items():
-        left, right, indicator = (
-            [column(rows, key, controller=objective, n=n) for n in dimensions]
-            for key in ("jensen_log_left", "jensen_log_right", "log_indicator")
+
+def print_main(rows):
+    titles = "".join(f"{title:>24s}" for title in ("steps not near", "l2 error", "violation"))
+    print(f"{'n':>3s}  {'':22s}{titles}{'failed':>8s}   median [2.5 %, 95 %]")
+    for n in sorted({int(row["n"]) for row in rows}):
+        for objective, (name, _, _) in CONTROLLERS.items():
+            text = f"{n:3d}  {name:22s}"
+            for key in MEASURES:
+                found = column(rows, key, controller=objective, n=n)
+                text += "{1:9.2f} [{0:5.2f}, {2:5.2f}]".format(*np.quantile(found, [0.025, 0.5, 0.95]))
+            print(f"{text}{column(rows, 'solver_failures', controller=objective, n=n).sum():8.0f}")
+        # paired by system and start
+        lq, goal = (column(rows, "steps_not_near", controller=objective, n=n) for objective in CONTROLLERS)
+        fewer = f"{np.median(lq - goal):.2f} fewer steps (median), fewer in {(goal < lq).mean():.0%}"
+        print(f"     the same start: {fewer}")
+
+
+def plot_jensen(rows, path):
+    """The margin of eq:jensen and its right side, and the same as a table."""
+    dimensions = sorted({int(row["n"]) for row in rows})
+    fig, axes = common.subplots(1, 2, figsize=(9, 3.6))
+    print("\neq:jensen on the closed loops, logarithms, medians: left side, right side, smallest margin,")
+    print("indicator sum (|x| <= 0.1)")
+    for objective, (name, colour, marker) in CONTROLLERS.items():
+        keys = ("jensen_log_left", "jensen_log_right", "log_indicator")
+        left, right, near = (
+            [column(rows, key, controller=objective, n=n) for n in dimensions] for key in keys
         )
         margins = [r - v for v, r in zip(left, right)]
-        name, marker = CONTROLLERS[objective], MARKERS[objective]
-        axes[0].plot(
-            dimensions, [np.median(m) for m in margins], "-" + marker, color=colour, lw=2, label=name
-        )
-        axes[0].fill_between(
-            dimensions,
-            *np.array([np.quantile(m, [0.025, 0.95]) for m in margins]).T,
-            color=colour,
-            alpha=0.2,
-            lw=0,
-        )
-        axes[1].plot(
-            dimensions,
-            [np.median(np.exp(r)) for r in right],
-            "-" + marker,
-            color=colour,
-            lw=2,
-            label=f"right side, {name}",
-        )
-        axes[1].plot(
-            dimensions,
-            [np.median(np.exp(i)) for i in indicator],
-            ":" + marker,
-            color=colour,
-            lw=2,
-            mfc="white",
-            label=f"share of steps with |x| ≤ 0.1, {name}",
-        )
+        draw_bands(axes[0], dimensions, margins, colour, "-" + marker, name)
+        style = dict(color=colour, marker=marker, lw=2)
+        axes[1].plot(dimensions, [np.median(np.exp(v)) for v in right], label=f"right side, {name}", **style)
+        style |= dict(ls=":", mfc="white", label=f"share of steps with |x| ≤ 0.1, {name}")
+        axes[1].plot(dimensions, [np.median(np.exp(v)) for v in near], **style)
         for i, n in enumerate(dimensions):
-            medians = [np.median(values[i]) for values in (left, right, indicator)]
-            print(
-                f"{n:3d}  {name:22s}{medians[0]:9.3f}{medians[1]:9.3f}{margins[i].min():11.2e}{medians[2]:9.3f}"
-            )
-    compared, worse, costlier = (
-        column(rows, key, controller="goal").sum()
-        for key in ("plans_compared", "plans_worse", "plans_costlier")
-    )
-    print(
-        f"of {compared:.0f} goal-conditioned plans, right side below that of LQ-MPC's plan at the same state: {worse:.0f}; "
-        f"objective with slack worse than of LQ-MPC's plan (local optima): {costlier:.0f}"
-    )
-    axes[0].set(xlabel="number of states n", ylabel="log right side − log left side", yscale="log")
-    axes[1].set(
-        xlabel="number of states n", ylabel="weighted mean over the episode", ylim=(0.885, 1)
-    )  # room for the legend
+            medians = [np.median(values[i]) for values in (left, right, near)]
+            text = f"{medians[0]:9.3f}{medians[1]:9.3f}{margins[i].min():11.2e}{medians[2]:9.3f}"
+            print(f"{n:3d}  {name:22s}{text}")
+    keys = ("plans_compared", "plans_worse", "plans_costlier")
+    compared, worse, costlier = (column(rows, key, controller="goal").sum() for key in keys)
+    print(f"of {compared:.0f} goal-conditioned plans, right side below that of LQ-MPC's plan: {worse:.0f};")
+    print(f"objective with slack worse than of LQ-MPC's plan (local optima): {costlier:.0f}")
+    axes[0].set(ylabel="log right side − log left side", yscale="log")
+    axes[1].set(ylabel="weighted mean over the episode", ylim=(0.885, 1))  # room for the legend
     for ax in axes:
-        ax.set_xscale("log", base=2)
-        ax.set_xticks(dimensions, dimensions)
+        by_dimension(ax, dimensions)
+        ax.set_xlabel("number of states n")
         ax.grid(alpha=0.3)
         ax.legend(frameon=False, fontsize=8)
-    save(fig, args.out / "figures/linear_scalability_jensen.png")
+    common.save(fig, path)
 
 
-def plot_sweep(args):
-    rows = cells.read(args.out / "results/linear_scalability_sweep.csv")
-    variants, dimensions = (
-        list(dict.fromkeys(row["variant"] for row in rows)),
-        sorted({int(row["n"]) for row in rows}),
-    )
+def plot_sweep(rows, path):
+    variants, dimensions = distinct(rows, "variant"), sorted({int(row["n"]) for row in rows})
     size = (2 + 2.7 * len(dimensions), 1.4 + 0.32 * len(variants))
-    fig, axes = plt.subplots(1, len(dimensions), figsize=size, sharey=True, layout="constrained")
-    print(
-        f"{'':26s}"
-        + "".join(f"{'n = ' + str(n):>30s}" for n in dimensions)
-        + "   median steps not near the origin: LQ, goal, gap; failed solves"
-    )
+    fig, axes = common.subplots(1, len(dimensions), figsize=size, sharey=True)
+    titles = "".join(f"{'n = ' + str(n):>30s}" for n in dimensions)
+    print(f"{'':26s}{titles}   median steps not near the origin: LQ, goal, gap; failed solves")
     for position, variant in enumerate(variants):
-        line = f"{variant:26s}"
+        text = f"{variant:26s}"
         for ax, n in zip(axes, dimensions):
-            medians = {}
-            for objective, colour in COLOURS.items():
+            medians = []
+            for objective, (name, colour, marker) in CONTROLLERS.items():
                 values = column(rows, "steps_not_near", variant=variant, controller=objective, n=n)
-                medians[objective] = np.median(values)
+                medians.append(np.median(values))
                 at = -position + (0.15 if objective == "goal" else -0.15)
                 ax.plot(np.quantile(values, [0.025, 0.95]), [at, at], color=colour, alpha=0.4, lw=3)
-                ax.plot(
-                    medians[objective],
-                    at,
-                    MARKERS[objective],
-                    color=colour,
-                    label=CONTROLLERS[objective] if not position else None,
-                )
+                ax.plot(medians[-1], at, marker, color=colour, label=None if position else name)
             failed = column(rows, "solver_failures", variant=variant, n=n).sum()
-            line += f"{medians['quadratic']:10.2f}{medians['goal']:7.2f}{medians['quadratic'] - medians['goal']:7.2f}{failed:6.0f}"
-        print(line)
+            text += f"{medians[0]:10.2f}{medians[1]:7.2f}{medians[0] - medians[1]:7.2f}{failed:6.0f}"
+        print(text)
     for ax, n in zip(axes, dimensions):
         ax.set(title=f"n = {n}", xlabel="steps not near the origin")
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(-np.arange(len(variants)), variants)
     axes[0].set_ylim(0.5 - len(variants), 0.5)
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
-    save(fig, args.out / "figures/linear_scalability_sweep.png")
+    common.legend(fig, axes[0], ncols=2)
+    common.save(fig, path)
 
 
 def main(args):
-    table = f"linear_scalability{'' if args.study == 'main' else '_sweep'}.csv"
-    cells.check(args, table, systems=(1, 1000), starts=(1, 1000), jobs=(1, 1024), seed=(0, 10**9))
+    name = "linear_scalability" if args.study == "main" else "linear_scalability_sweep"
+    common.check(args, name, systems=(1, 1000), starts=(1, 1000))
     if not args.plot_only:
-        collect(args)
-    (plot_main if args.study == "main" else plot_sweep)(args)
+        common.write(collect(args), args.table(name))
+    rows = common.read(args.table(name))
+    if args.study == "sweep":
+        return plot_sweep(rows, args.figure(name))
+    plot_main(rows, args.figure(name))
+    print_main(rows)
+    plot_jensen(rows, args.figure("linear_scalability_jensen"))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

@@ -11,41 +11,26 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import goal_mpc as gm
 from envs import double_pendulum
-from experiments import common as cells
-from experiments.common import HERE
+from experiments import common
+from experiments.common import column, grouped, select
+from experiments.palette import BLUE, GREEN, ORANGE
 
-CELLS = [
-    (objective, horizon, guide)
-    for horizon, guide in ((25, 0), (75, 0), (300, 75), (300, 0))
-    for objective in ("expert", "quadratic", "goal")
-]
-COLOURS = {"expert": "#009E73", "quadratic": "#E69F00", "goal": "#0072B2"}  # Okabe and Ito
-MARKERS = {"expert": "s", "quadratic": "^", "goal": "o"}
+OBJECTIVES = {"expert": (GREEN, "s"), "quadratic": (ORANGE, "^"), "goal": (BLUE, "o")}
+GUIDED = (25, 0), (75, 0), (300, 75), (300, 0)  # horizon of the controller and of its guide
+PANELS = {"time_near_goal": "time near goal [steps]", "action_total_variation": "action total variation [N]"}
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True)
+class Args(common.ParallelArgs):
     episodes: int = 10
-    """starts: both angles 0.9 pi plus up to 0.05 rad each"""
-    seed: int = 0
-    """seed of the first start"""
+    """starts, of seeds in a row: both angles 0.9 pi plus up to 0.05 rad each"""
     jobs: int = 1
     """processes; more than one per core disturbs the solve times"""
-    quick: bool = False
-    """2 starts of 5 steps with short horizons: a smoke test"""
-    plot_only: bool = False
-    """redraw the figure from the CSV"""
-    runs: Path = Path("runs/dip_performance")
-    """where finished cells are kept, so that a second call continues"""
-    out: Path = HERE
-    """folder whose results/ and figures/ are written"""
 
 
 class Guided(gm.ScenarioMPC):
@@ -60,7 +45,7 @@ class Guided(gm.ScenarioMPC):
         yield from super().first_guesses(x0)
 
 
-def run_cell(cell):
+def run(cell):
     """One controller from every start; rows of results.csv with the guide's horizon."""
     settings, guide_horizon = cell
     mpc, goals, rows = gm.build_controller(settings, Guided), np.zeros((settings.steps, 2)), []
@@ -68,116 +53,75 @@ def run_cell(cell):
     for seed in range(settings.seed, settings.seed + settings.episodes):
         x0, psi = gm.start_and_plant(double_pendulum, seed, random_plant=False)
         x, u, _, log = gm.simulate(mpc, x0, psi, goals)
-        head = {
-            "env": settings.env,
-            "objective": settings.objective,
-            "horizon": settings.horizon,
-            "guide_horizon": guide_horizon,
-        }
-        rows.append(
-            head
-            | {"seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)}
-            | gm.summary(double_pendulum, x, u, goals, log)
-        )
+        head = {key: getattr(settings, key) for key in ("env", "objective", "horizon")}
+        head |= {"guide_horizon": guide_horizon, "seed": seed, "first_solve_ms": round(log[0]["wall_ms"], 6)}
+        rows.append(head | gm.summary(double_pendulum, x, u, goals, log))
     return rows
 
 
 def collect(args):
+    few = dict(episodes=2, steps=5, compile=False) if args.quick else dict(episodes=args.episodes)
     work = []
-    for objective, horizon, guide in CELLS:
-        settings = gm.Args(objective=objective, horizon=horizon, episodes=args.episodes, seed=args.seed)
+    for horizon, guide in GUIDED:
         if args.quick:
-            settings, guide = (
-                replace(settings, horizon=horizon // 25, episodes=2, steps=5, compile=False),
-                guide // 25,
-            )
-        work.append((settings, guide))
-    inputs = [__file__, gm.__file__, gm.envs.__file__, double_pendulum.__file__]
-    cells.write(
-        cells.collect(run_cell, work, args.jobs, args.runs, inputs), args.out / "results/dip_performance.csv"
-    )
+            horizon, guide = horizon // 25, guide // 25
+        for objective in OBJECTIVES:
+            work.append((gm.Args(objective=objective, horizon=horizon, seed=args.seed, **few), guide))
+    return common.collect(run, work, args.runs, args.jobs)
 
 
-def plot(args):
-    rows = cells.read(args.out / "results/dip_performance.csv")
-    panels = {
-        "time_near_goal": "time near goal [steps]",
-        "action_total_variation": "action total variation [N]",
-    }
-    columns = list(dict.fromkeys((row["horizon"], row["guide_horizon"]) for row in rows))
+def plot(rows, path):
+    columns = list(grouped(rows, "horizon", "guide_horizon"))
     variation = {}  # (objective, column): median
-    fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
-    print(
-        f"{'objective':10s}{'N':>5s}{'guide':>6s}{'near goal: median [min, max]':>32s}{'action TV: median [min, max]':>32s}"
-        f"{'ms median':>11s}{'p95':>8s}{'worst':>9s}{'failed':>8s}"
-    )
-    for objective, colour in COLOURS.items():
+    fig, axes = common.subplots(2, 1, figsize=(8, 5.6), sharex=True)
+    head = f"{'objective':10s}{'N':>5s}{'guide':>6s}{'near goal: median [min, max]':>32s}"
+    head += f"{'action TV: median [min, max]':>32s}{'ms median':>11s}{'p95':>8s}{'worst':>9s}{'failed':>8s}"
+    print(head)
+    for order, (objective, (colour, marker)) in enumerate(OBJECTIVES.items()):
         for position, (horizon, guide) in enumerate(columns):
-            mine = [
-                row
-                for row in rows
-                if (row["objective"], row["horizon"], row["guide_horizon"]) == (objective, horizon, guide)
-            ]
-            column = {
-                key: np.array([float(row[key]) for row in mine])
-                for key in mine[0]
-                if key not in ("env", "objective")
-            }
-            at = position + 0.25 * (list(COLOURS).index(objective) - 1)
-            line = f"{objective:10s}{horizon:>5s}{guide:>6s}"
-            for ax, key in zip(axes, panels):
-                values = column[key]
+            mine = select(rows, objective=objective, horizon=horizon, guide_horizon=guide)
+            at = position + 0.25 * (order - 1)
+            text = f"{objective:10s}{horizon:>5s}{guide:>6s}"
+            for ax, key in zip(axes, PANELS):
+                values, label = column(mine, key), objective if not position else None
                 jitter = np.random.default_rng(0).uniform(-0.06, 0.06, len(values))
-                ax.plot(at + jitter, values, MARKERS[objective], color=colour, ms=4, alpha=0.5)
-                ax.plot(
-                    [at - 0.1, at + 0.1],
-                    [np.median(values)] * 2,
-                    color=colour,
-                    lw=3,
-                    label=objective if not position else None,
-                )
-                line += f"{np.median(values):16.1f} [{values.min():5.1f}, {values.max():5.1f}]"
-            variation[objective, position] = np.median(column["action_total_variation"])
-            times = (
-                np.median(column["solve_ms_median"]),
-                np.median(column["solve_ms_p95"]),
-                column["solve_ms_max"].max(),
-            )
-            print(
-                f"{line}{times[0]:11.1f}{times[1]:8.1f}{times[2]:9.0f}{column['solver_failures'].sum():8.0f}"
-            )
-    fall = {
-        objective: 1 - variation[objective, 2] / variation[objective, 0]
-        for objective in ("quadratic", "goal")
-    }
-    print(
-        f"expert's variation in the second column: {variation['expert', 1] / variation['quadratic', 1]:.2f} of the quadratic agent's, "
-        f"{variation['expert', 1] / variation['goal', 1]:.2f} of the goal-conditioned agent's; "
-        f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}"
-    )
-    guesses = {"0": "start held"} | {
-        guide: f"closed loop, N = {guide}" for _, guide in columns if guide != "0"
-    }
-    axes[1].set_xticks(
-        range(len(columns)), [f"N = {horizon}\nfirst guess:\n{guesses[guide]}" for horizon, guide in columns]
-    )
-    for ax, title in zip(axes, panels.values()):
+                ax.plot(at + jitter, values, marker, color=colour, ms=4, alpha=0.5)
+                ax.plot([at - 0.1, at + 0.1], [np.median(values)] * 2, color=colour, lw=3, label=label)
+                text += f"{np.median(values):16.1f} [{values.min():5.1f}, {values.max():5.1f}]"
+            variation[objective, position] = np.median(column(mine, "action_total_variation"))
+            median, p95, worst = (column(mine, f"solve_ms_{key}") for key in ("median", "p95", "max"))
+            failed = column(mine, "solver_failures").sum()
+            print(f"{text}{np.median(median):11.1f}{np.median(p95):8.1f}{worst.max():9.0f}{failed:8.0f}")
+    print_variation(variation)
+    guesses = {guide: f"closed loop, N = {guide}" for _, guide in columns} | {"0": "start held"}
+    labels = [f"N = {horizon}\nfirst guess:\n{guesses[guide]}" for horizon, guide in columns]
+    axes[1].set_xticks(range(len(columns)), labels)
+    for ax, title in zip(axes, PANELS.values()):
         ax.set_ylabel(title)
         ax.set_ylim(bottom=0)
         ax.grid(axis="y", alpha=0.3)
     axes[0].set_title(f"{len(mine)} starts per controller; bars: medians", fontsize=10)
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
-    path = args.out / "figures/dip_performance.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=150)
+    common.legend(fig, axes[0], ncols=3)
+    common.save(fig, path)
+
+
+def print_variation(variation):
+    """What the paper says of the medians of action variation, {(objective, column): median}."""
+    share = {name: variation["expert", 1] / variation[name, 1] for name in ("quadratic", "goal")}
+    fall = {name: 1 - variation[name, 2] / variation[name, 0] for name in ("quadratic", "goal")}
+    print(
+        f"expert's variation in the second column: {share['quadratic']:.2f} of the quadratic agent's, "
+        f"{share['goal']:.2f} of the goal-conditioned agent's; "
+        f"fall from the first column to the third: quadratic {fall['quadratic']:.0%}, goal {fall['goal']:.0%}"
+    )
 
 
 def main(args):
-    cells.check(args, "dip_performance.csv", episodes=(1, 1000), seed=(0, 10**9), jobs=(1, 1024))
+    common.check(args, "dip_performance", episodes=(1, 1000))
     if not args.plot_only:
-        collect(args)
-    plot(args)
+        common.write(collect(args), args.table("dip_performance"))
+    plot(common.read(args.table("dip_performance")), args.figure("dip_performance"))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

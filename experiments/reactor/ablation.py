@@ -15,32 +15,31 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from experiments import common as cells
-from experiments.common import HERE
+from experiments import common
+from experiments.common import column, distinct, select
+from experiments.palette import BLUE, RED
 from experiments.reactor import loops
 from experiments.reactor.deploy import KINDS, MEASURES, RL_MPC
 
 AWARE = KINDS["constraint-aware"]
 PLANT_DATA = "plant data"
 TRAINING = {  # setting: arguments of sac_her_branching.py
-    "blind to constraints": (),
-    "constraint weight 1": ("--constraint-weight", "1"),
-    "constraint weight 2": ("--constraint-weight", "2"),
-    "constraint weight 5": ("--constraint-weight", "5"),
-    "discount 0.98": (*AWARE, "--gamma", "0.98"),
-    "discount 0.95": (*AWARE, "--gamma", "0.95"),
-    "no entropy in the target": (*AWARE, "--no-entropy-in-target"),
-    "reward sigma^2 = 1e-3": (*AWARE, "--reward-sigma2", "1e-3"),
-    "200,000 transitions": (*AWARE, "--total-timesteps", "200000"),
-    "batch 512": (*AWARE, "--batch-size", "512"),
+    "blind to constraints": {},
+    "constraint weight 1": dict(constraint_weight=1.0),
+    "constraint weight 2": dict(constraint_weight=2.0),
+    "constraint weight 5": dict(constraint_weight=5.0),
+    "discount 0.98": AWARE | dict(gamma=0.98),
+    "discount 0.95": AWARE | dict(gamma=0.95),
+    "no entropy in the target": AWARE | dict(entropy_in_target=False),
+    "reward sigma^2 = 1e-3": AWARE | dict(reward_sigma2=1e-3),
+    "200,000 transitions": AWARE | dict(total_timesteps=200_000),
+    "batch 512": AWARE | dict(batch_size=512),
     PLANT_DATA: AWARE,
 }
-DEPLOYMENT = {  # setting: keywords of rl_mpc_deploy.Args
+DEPLOYMENT = {  # setting: keywords of rl_mpc_deploy.Args and of loops.Loop
     "slack weight 1": dict(slack_weight=1.0),
     "slack weight 3": dict(slack_weight=3.0),
     "slack weight 5": dict(slack_weight=5.0),
@@ -52,35 +51,24 @@ DEPLOYMENT = {  # setting: keywords of rl_mpc_deploy.Args
     "nominal model": dict(robust_horizon=0),
     "one start: the last plan": dict(like="one start"),
 }
+SHOWN = {"median": (0.5, BLUE, "o"), "5th percentile": (0.05, RED, "d")}  # quantile, colour, marker
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True)
+class Args(common.ParallelArgs):
+    seed: int = 2
+    """of the draws; the comparison of deploy.py has seed 0"""
     episodes: int = 25
     """paired draws"""
-    seed: int = 2
-    """seed of the draws; the comparison of cstr_deploy.py has seed 0"""
     agents: tuple[int, ...] = (1, 2, 3)
     """training seeds"""
-    jobs: int = 2
-    """processes"""
-    quick: bool = False
-    """2 draws of 3 steps, one critic, hardly trained: a smoke test"""
-    plot_only: bool = False
-    """redraw the figure from the CSV"""
-    runs: Path = Path("runs/cstr_loops")
-    """where agents and finished blocks are kept, so that a second call continues"""
-    out: Path = HERE
-    """folder whose results/ and figures/ are written"""
 
 
 def plant_data(critic, args):
     """A trajectories.npz of RL+MPC with this critic in its loops on draws of another seed; returns its path."""
     rows = loops.collect({"data": RL_MPC | dict(critic=critic)}, args, episodes=64, seed=args.seed + 1000)
-    x, u = (
-        np.stack([loops.replay(row) for row in rows]),
-        np.stack([json.loads(row["actions"]) for row in rows]),
-    )
+    x = np.stack([loops.replay(row) for row in rows])
+    u = np.stack([json.loads(row["actions"]) for row in rows])
     path = args.runs / f"plant_data_{hashlib.sha256(x.tobytes() + u.tobytes()).hexdigest()[:12]}.npz"
     if not path.exists():
         np.savez_compressed(args.runs / "unfinished.npz", rl_mpc_x=x, rl_mpc_u=u)
@@ -90,80 +78,61 @@ def plant_data(critic, args):
 
 def collect(args):
     seeds = args.agents[:1] if args.quick else args.agents
-    settings = {"default": AWARE} | dict(list(TRAINING.items())[-2:] if args.quick else TRAINING)
-    plain = [(seed, *flags) for label, flags in settings.items() if label != PLANT_DATA for seed in seeds]
-    critics = dict(zip(plain, loops.train(plain, args)))
-    default = [critics[seed, *AWARE] for seed in seeds]
-    with_data = loops.train(
-        [(seed, *AWARE, "--add-plant-data", plant_data(c, args)) for seed, c in zip(seeds, default)], args
-    )
-    rows, variants = [], {}
-    for label, flags in settings.items():
-        paths = with_data if label == PLANT_DATA else [critics[seed, *flags] for seed in seeds]
-        variants |= {(label, seed): dict(critic=path) for seed, path in zip(seeds, paths)}
-    for label, options in list(DEPLOYMENT.items())[: 2 if args.quick else None]:
-        variants |= {(label, seed): dict(critic=path) | options for seed, path in zip(seeds, default)}
+    training = {"default": AWARE} | dict(list(TRAINING.items())[-2:] if args.quick else TRAINING)
+    deployment = dict(list(DEPLOYMENT.items())[: 2 if args.quick else None])
+
+    agents = {(label, seed): training[label] | dict(seed=seed) for label in training for seed in seeds}
+    plain = {agent: settings for agent, settings in agents.items() if agent[0] != PLANT_DATA}
+    critics = dict(zip(plain, loops.train(list(plain.values()), args)))
+    data = {seed: plant_data(critics["default", seed], args) for seed in seeds}
+    with_data = [agents[PLANT_DATA, seed] | dict(add_plant_data=data[seed]) for seed in seeds]
+    critics |= {(PLANT_DATA, seed): path for seed, path in zip(seeds, loops.train(with_data, args))}
+
     # a critic blind to constraints is planned with at the default's slack weight, too
-    named = {
-        f"{label} | {seed}": RL_MPC | dict(slack_weight=2.0) | options
-        for (label, seed), options in variants.items()
-    }
-    for row in loops.table(loops.collect(named, args)):
+    usual = RL_MPC | dict(slack_weight=2.0)
+    variants = {f"{label} | {seed}": usual | dict(critic=critics[label, seed]) for label, seed in agents}
+    for label, options in deployment.items():
+        for seed in seeds:
+            variants[f"{label} | {seed}"] = usual | dict(critic=critics["default", seed]) | options
+    rows = []
+    for row in loops.table(loops.collect(variants, args)):
         label, seed = row["variant"].split(" | ")
         rows.append({"agent": seed} | row | {"variant": label})
     return rows
 
 
 def plot(rows, path):
-    labels = list(dict.fromkeys(row["variant"] for row in rows))
-    fig, axes = plt.subplots(1, 2, figsize=(10, 0.9 + 0.28 * len(labels)), sharey=True, layout="constrained")
-    print(
-        f"{'':28s}time near goal: median  5 %-ile   outside: median  5 %-ile     mean   offset   in brackets: range over critics"
-    )
+    labels = distinct(rows, "variant")
+    fig, axes = common.subplots(1, 2, figsize=(10, 0.9 + 0.28 * len(labels)), sharey=True)
+    titles = "time near goal: median  5 %-ile   outside: median  5 %-ile     mean   offset"
+    print(f"{'':28s}{titles}   in brackets: range over critics")
     for position, label in enumerate(labels):
-        mine, text = [row for row in rows if row["variant"] == label], f"{label:28s}"
-        agents = sorted({row["agent"] for row in mine})
+        mine, text = select(rows, variant=label), f"{label:28s}"
         for ax, key in zip(axes, MEASURES):
-            by_agent = [
-                np.array([float(row[key]) for row in mine if row["agent"] == agent]) for agent in agents
-            ]
-            for measure, colour, marker in (
-                (np.median, "#0072B2", "o"),
-                (lambda v: np.quantile(v, 0.05), "#D55E00", "d"),
-            ):
-                found, pooled = [measure(v) for v in by_agent], measure(np.concatenate(by_agent))
+            by_agent = [column(mine, key, agent=agent) for agent in sorted(distinct(mine, "agent"))]
+            together = np.concatenate(by_agent)
+            for q, colour, marker in SHOWN.values():
+                found, pooled = [np.quantile(v, q) for v in by_agent], np.quantile(together, q)
                 ax.plot(found, [-position] * len(found), marker, color=colour, ms=4, alpha=0.6)
                 ax.plot([pooled] * 2, [-position - 0.35, -position + 0.35], color=colour, lw=2)
                 text += f"{pooled:8.1f} [{min(found):.1f}, {max(found):.1f}]"
-        offset = np.median([float(row["ape_tail"]) for row in mine])
-        print(f"{text}{np.mean(np.concatenate(by_agent)):8.1f}{offset:8.1f}")
+        print(f"{text}{together.mean():8.1f}{np.median(column(mine, 'ape_tail')):8.1f}")
     for ax, title in zip(axes, MEASURES.values()):
         ax.set_xlabel(title)
         ax.grid(alpha=0.3)
     axes[0].set_yticks(-np.arange(len(labels)), labels)
-    styles = {"median": ("#0072B2", "o"), "5th percentile": ("#D55E00", "d")}
-    handles = [
-        plt.Line2D([], [], color=colour, marker=marker, label=label)
-        for label, (colour, marker) in styles.items()
-    ]
-    fig.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=2,
-        frameon=False,
-        title="bar: all draws; points: each of the critics",
-    )
-    fig.savefig(path, dpi=150)
+    for name, (_, colour, marker) in SHOWN.items():
+        axes[0].plot([], [], marker=marker, color=colour, label=name)
+    common.legend(fig, axes[0], ncols=2, title="bar: all draws; points: each of the critics")
+    common.save(fig, path)
 
 
 def main(args):
-    cells.check(args, "cstr_ablation.csv", episodes=(1, 10**6), seed=(0, 10**6), jobs=(1, 1024))
-    table, figure = args.out / "results/cstr_ablation.csv", args.out / "figures/cstr_ablation.png"
+    common.check(args, "cstr_ablation", episodes=(1, 10**6))
     if not args.plot_only:
-        cells.write(collect(args), table)
-    figure.parent.mkdir(parents=True, exist_ok=True)
-    plot(cells.read(table), figure)
+        common.write(collect(args), args.table("cstr_ablation"))
+    plot(common.read(args.table("cstr_ablation")), args.figure("cstr_ablation"))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

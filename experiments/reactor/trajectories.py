@@ -13,32 +13,34 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.runs.comparison import run_episode
 from envs.runs.figure import draw_episode
-from experiments import common as cells
-from experiments.common import HERE
+from experiments import common
+from experiments.common import PRETRAINED, column, select
+from experiments.palette import BLUE, GREEN, RED, SKY
 
-PAPER = dict(critic=HERE / "pretrained/cstr_robust.pt")
+PAPER, DOTS = dict(critic=PRETRAINED / "cstr_robust.pt"), (0, (1, 1.5))
 CONTROLLERS = {  # name in the table: (what is built, keywords of rl_mpc_deploy.Args, label, lines)
-    "actor": ("actor", PAPER, "RL, paper's", {"color": "#D55E00", "ls": "--"}),
-    "robust_mpc": ("robust_mpc", {}, "robust MPC", {"color": "#0072B2", "ls": "-."}),
-    "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", {"color": "#56B4E9"}),
-    "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", {"color": "#009E73"}),
+    "actor": ("actor", PAPER, "RL, paper's", {"color": RED, "ls": "--"}),
+    "robust_mpc": ("robust_mpc", {}, "robust MPC", {"color": BLUE, "ls": "-."}),
+    "rl_mpc_paper": ("rl_mpc", PAPER, "RL+MPC, paper's", {"color": SKY}),
+    "rl_mpc": ("rl_mpc", {}, "RL+MPC, constraint-aware", {"color": GREEN}),
     "rl_mpc_hard": (
         "rl_mpc",
         dict(constraints="hard"),
         "the same, hard constraints",
-        {"color": "black", "ls": (0, (1, 1.5))},
+        {"color": "black", "ls": DOTS},
     ),
 }
+COLUMNS = cstr.STATE_NAMES + cstr.ACTION_NAMES
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True)
+class Args(common.StudyArgs):
     goal: float = 0.6
     """c_B, mol/l"""
     alpha: float = 1.0
@@ -49,55 +51,40 @@ class Args:
     """c_A, c_B [mol/l], T_R, T_K [degC]"""
     steps: int = 100
     """sampling times"""
-    quick: bool = False
-    """5 steps: a smoke test"""
-    plot_only: bool = False
-    """redraw the figure from the CSV"""
-    out: Path = HERE
-    """folder whose results/ and figures/ are written"""
 
 
-def profile(name, args):
+def trajectory(name, args):
     """Rows of one controller's closed loop; the last action is held for the last row."""
     kind, options, *_ = CONTROLLERS[name]
-    settings = deploy.Args(goal=(args.goal,), **options)
-    controller = deploy.build_controller(kind, settings)
+    controller = deploy.build_controller(kind, deploy.Args(goal=(args.goal,), **options))
     psi, steps = np.array([args.alpha, args.beta]), 5 if args.quick else args.steps
-    x, u, row = deploy.run_episode(controller, cstr, np.array(args.start), psi, controller.goal, steps)
+    x, u, row = run_episode(controller, cstr, np.array(args.start), psi, controller.goal, steps)
     print(name, {key: round(float(value), 2) for key, value in row.items()})
-    head = {
-        "controller": name,
-        "horizon": controller.horizon or 0,
-        "goal": args.goal,
-        "alpha": args.alpha,
-        "beta": args.beta,
-    }
-    return [
-        head | {"step": t} | dict(zip(cstr.STATE_NAMES + cstr.ACTION_NAMES, [*x[t], *u[min(t, steps - 1)]]))
-        for t in range(steps + 1)
-    ]
+    head = {"controller": name, "horizon": controller.horizon or 0, "goal": args.goal}
+    head |= {"alpha": args.alpha, "beta": args.beta}
+    values = np.hstack([x, np.vstack([u, u[-1:]])])
+    return [head | {"step": t} | dict(zip(COLUMNS, values[t])) for t in range(steps + 1)]
+
+
+def plot(rows, path):
+    paths = {}
+    for name, (_, _, label, style) in CONTROLLERS.items():
+        mine = select(rows, controller=name)
+        label += "" if name == "actor" else f", N = {mine[0]['horizon']}"
+        values = np.stack([column(mine, key) for key in COLUMNS], axis=1)
+        paths[label] = values[:, :4], values[:-1, 4:], style
+    goals = np.full((len(values) - 1, 1), float(rows[0]["goal"]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draw_episode(cstr, paths, goals, path)
 
 
 def main(args):
-    cells.check(args, "cstr_profile.csv", goal=(0.1, 2), alpha=(0.5, 1.5), beta=(0.1, 10), steps=(1, 10**5))
-    table, columns = args.out / "results/cstr_profile.csv", cstr.STATE_NAMES + cstr.ACTION_NAMES
+    common.check(args, "cstr_profile", goal=(0.1, 2), alpha=(0.5, 1.5), beta=(0.1, 10), steps=(1, 10**5))
     if not args.plot_only:
-        cells.write([row for name in CONTROLLERS for row in profile(name, args)], table)
-    rows, paths = cells.read(table), {}
-    for name in CONTROLLERS:
-        mine = [row for row in rows if row["controller"] == name]
-        values = np.array([[float(row[column]) for column in columns] for row in mine])
-        label, style = CONTROLLERS[name][2:]
-        label += "" if name == "actor" else f", N = {mine[0]['horizon']}"
-        paths[label] = values[:, :4], values[:-1, 4:], style
-    (args.out / "figures").mkdir(parents=True, exist_ok=True)
-    draw_episode(
-        cstr,
-        paths,
-        np.full((len(values) - 1, 1), float(rows[0]["goal"])),
-        args.out / "figures/cstr_profile.png",
-    )
+        rows = [row for name in CONTROLLERS for row in trajectory(name, args)]
+        common.write(rows, args.table("cstr_profile"))
+    plot(common.read(args.table("cstr_profile")), args.figure("cstr_profile"))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

@@ -11,19 +11,15 @@ figures/training_speed.png, which needs both.
 """
 
 import functools
-import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import torch.nn as nn
-import tyro
 from scipy.stats import trim_mean
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -32,73 +28,69 @@ import sac_her_branching as sac
 from envs import cstr
 from envs.agents.evaluation import evaluation_row
 from envs.agents.policy import Scaling
-from experiments import common as cells
-from experiments.common import HERE, ROOT
+from experiments import common
+from experiments.common import column, grouped, rounded, without
+from experiments.palette import BLUE, GREY, ORANGE, RED
 
 VARIANTS = {  # of the arguments of sac_her_branching.py
-    "default": [],
-    "update per 4 transitions": ["--steps-per-update", "4"],
-    "update per 16 transitions": ["--steps-per-update", "16"],
-    "batch 128": ["--batch-size", "128"],
-    "batch 512": ["--batch-size", "512"],
-    "batch 512, update per 16": ["--batch-size", "512", "--steps-per-update", "16"],
-    "batch 1024, update per 32": ["--batch-size", "1024", "--steps-per-update", "32"],
-    "8 plants": ["--num-envs", "8"],
-    "128 plants": ["--num-envs", "128"],
-    "learning rate held at 1e-3": ["--learning-rate", "1e-3", "--learning-rate-end", "1"],
-    "tau 0.005": ["--tau", "0.005"],
-    "4 branches in the targets": ["--branches", "4"],
-    "half the transitions, update per 4": ["--total-timesteps", "50000", "--steps-per-update", "4"],
+    "default": {},
+    "update per 4 transitions": dict(steps_per_update=4),
+    "update per 16 transitions": dict(steps_per_update=16),
+    "batch 128": dict(batch_size=128),
+    "batch 512": dict(batch_size=512),
+    "batch 512, update per 16": dict(batch_size=512, steps_per_update=16),
+    "batch 1024, update per 32": dict(batch_size=1024, steps_per_update=32),
+    "8 plants": dict(num_envs=8),
+    "128 plants": dict(num_envs=128),
+    "learning rate held at 1e-3": dict(learning_rate=1e-3, learning_rate_end=1.0),
+    "tau 0.005": dict(tau=0.005),
+    "4 branches in the targets": dict(branches=4),
+    "half the transitions, update per 4": dict(total_timesteps=50_000, steps_per_update=4),
 }
 PEERS = {  # Stable-Baselines3: plants, updates per step of all plants, learning rate and its end, tau
     "SB3, its own settings": dict(num_envs=1, updates=1, learning_rate=3e-4, end=1.0, tau=0.005),
     "SB3, our settings": dict(num_envs=32, updates=4, learning_rate=3e-3, end=0.0, tau=0.02),
 }
+LINES = {"default": (BLUE, "-"), "SB3, its own settings": (RED, "--"), "SB3, our settings": (ORANGE, "-.")}
+QUICK = dict(total_timesteps=2000, eval_every=1000, eval_episodes=20)
 QUALITIES = (3.0, 2.5, 2.2)  # percent, robust median error
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(common.ParallelArgs):
     study: Literal["ablation", "peer", "profile"] = "ablation"
     """ablation: settings of sac_her_branching.py; peer: Stable-Baselines3; profile: one update, part by part"""
     seeds: int = 5
     """training seeds per variant (peer: 3 at most)"""
-    seed: int = 0
-    """the first of them"""
     jobs: int = 1
     """runs at a time, each on one thread"""
-    quick: bool = False
-    """2,000 transitions, two variants, one seed: a smoke test"""
-    plot_only: bool = False
-    """redraw from the CSV"""
-    runs: Path = Path("runs/training_speed")
-    """where finished runs are kept, so that a second call continues"""
-    out: Path = HERE
-    """folder whose results/ and figures/ are written"""
 
 
-def ours(cell):
-    """Evaluations of one run of sac_her_branching.py, in a process of its own."""
-    variant, seed, quick = cell
-    with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            str(ROOT / "sac_her_branching.py"),
-            "--seed",
-            str(seed),
-            "--save-every",
-            "0",
-            "--out",
-            folder,
-        ]
-        command += VARIANTS[variant]
-        if quick:
-            command += ["--total-timesteps", "2000", "--eval-every", "1000", "--eval-episodes", "20"]
-        subprocess.run(command, check=True, capture_output=True)
-        return [
-            {"variant": variant, "seed": seed} | row
-            for row in cells.read(next(Path(folder).glob("*/evaluations.csv")))
-        ]
+def in_order(rows):
+    """By variant and seed; they are run seed by seed, so that what disturbs one variant disturbs all."""
+    order = [*VARIANTS, *PEERS]
+    return sorted(rows, key=lambda row: (order.index(row["variant"]), int(row["seed"])))
+
+
+def ours(args):
+    """Evaluations of every run of sac_her_branching.py; its agents are kept apart, since those of other studies had company."""
+    seeds, few = (1, QUICK) if args.quick else (args.seeds, {})
+    variants = list(VARIANTS)[: 2 if args.quick else None]
+    runs = [(variant, args.seed + i) for i in range(seeds) for variant in variants]
+    agents, rows = [VARIANTS[variant] | few | dict(seed=seed) for variant, seed in runs], []
+    for (variant, seed), folder in zip(runs, common.train(agents, args.runs / "alone", args.jobs)):
+        noted = without(common.record(folder), "wall_seconds")
+        evaluations = common.read(folder / "evaluations.csv")
+        rows += [{"variant": variant, "seed": seed} | row | noted for row in evaluations]
+    return in_order(rows)
+
+
+def peers(args):
+    """Evaluations of every run of Stable-Baselines3."""
+    seeds, variants = (1, list(PEERS)[-1:]) if args.quick else (min(args.seeds, 3), PEERS)
+    todo = [(variant, args.seed + i, args.quick) for i in range(seeds) for variant in variants]
+    rows = common.collect(peer, todo, args.runs, args.jobs)
+    return in_order([row | {"jobs": args.jobs, "machine": common.machine()} for row in rows])
 
 
 def peer(cell):
@@ -126,13 +118,9 @@ def peer(cell):
         def _on_step(self):
             if self.num_timesteps >= self.due:
                 seconds = time.perf_counter() - self.tick
-                row = evaluation_row(self, 20 if quick else 200)
-                updates = {
-                    "step": self.num_timesteps,
-                    "updates": self.model._n_updates,
-                    "train_seconds": round(seconds, 2),
-                }
-                self.rows.append({"variant": variant, "seed": seed} | updates | row)
+                row = {"variant": variant, "seed": seed, "step": self.num_timesteps}
+                row |= {"updates": self.model._n_updates, "train_seconds": round(seconds, 2)}
+                self.rows.append(row | evaluation_row(self, 20 if quick else 200))
                 self.due += every
                 self.tick = time.perf_counter() - seconds
             return True
@@ -140,21 +128,17 @@ def peer(cell):
         plant = cstr
 
         def act(self, x, goal):
-            obs = {
-                "observation": x,
-                "achieved_goal": x[:, cstr.GOAL_INDEX],
-                "desired_goal": np.broadcast_to(goal, (len(x), len(goal))),
-            }
+            goals = np.broadcast_to(goal, (len(x), len(goal)))
+            obs = {"observation": x, "achieved_goal": x[:, cstr.GOAL_INDEX], "desired_goal": goals}
             return self.model.predict(obs, deterministic=True)[0]
 
     variant, seed, quick = cell
     torch.set_num_threads(1)
     settings, every, total = PEERS[variant], 1_000 if quick else 10_000, 2_000 if quick else 100_000
     start, end = settings["learning_rate"], settings["end"]
-    first = max(
-        1_000, settings["num_envs"] * (cstr.EPISODE_STEPS + 1)
-    )  # its replay needs a whole episode of each plant
-    vec = make_vec_env(functools.partial(gym.make, cstr.ENV_ID), settings["num_envs"], seed=seed)
+    num_envs = settings["num_envs"]
+    first = max(1_000, num_envs * (cstr.EPISODE_STEPS + 1))  # its replay needs a whole episode of each plant
+    vec = make_vec_env(functools.partial(gym.make, cstr.ENV_ID), num_envs, seed=seed)
     # the same networks, discount, batch, share of hindsight goals and buffer as sac_her_branching.py
     model = SAC(
         "MultiInputPolicy",
@@ -207,9 +191,8 @@ def profile(args):
     def actor():
         agent.optimisers["actor"].zero_grad()
         action, log_prob = agent.actor.sample(features, agent.generator)
-        (log_prob - agent.critic(features, action).amin(0)).mean().backward(
-            inputs=list(agent.actor.parameters())
-        )
+        loss = (log_prob - agent.critic(features, action).amin(0)).mean()
+        loss.backward(inputs=list(agent.actor.parameters()))
 
     def targets():
         with torch.no_grad():
@@ -217,9 +200,13 @@ def profile(args):
 
     def averages():
         with torch.no_grad():
-            torch._foreach_lerp_(
-                list(agent.target.parameters()), list(agent.critic.parameters()), settings.tau
-            )
+            for slow, fast in zip(agent.target.parameters(), agent.critic.parameters()):
+                slow.lerp_(fast, settings.tau)
+
+    def update():
+        x, u, goal, x_next = buffer.sample(settings.batch_size, agent.generator)
+        agent.update_critic(x, u, goal, x_next)
+        agent.update_actor(x, goal)
 
     parts = {
         "replay with hindsight": lambda: buffer.sample(settings.batch_size, agent.generator),
@@ -229,15 +216,11 @@ def profile(args):
         "target networks": averages,
         "actor, forward and backward": actor,
         "actor, Adam": agent.optimisers["actor"].step,
-        "whole update": lambda: (
-            buffer.sample(settings.batch_size, agent.generator),
-            agent.update_critic(x, u, goal, x_next),
-            agent.update_actor(x, goal),
-        ),
+        "whole update": update,
         "exploring actions": lambda: agent.explore(obs["observation"], obs["desired_goal"]),
         "step of all plants and storing": add,
     }
-    rows, updates = [], settings.num_envs / settings.steps_per_update
+    rows, steps = [], settings.total_timesteps / settings.num_envs
     for name, part in parts.items():
         times = []
         for _ in range(repeats):
@@ -245,24 +228,11 @@ def profile(args):
             part()
             times.append(1e3 * (time.perf_counter() - tick))
         per_step = name in ("exploring actions", "step of all plants and storing")
-        share = (
-            np.median(times)
-            * (1 if per_step else updates)
-            * settings.total_timesteps
-            / settings.num_envs
-            / 1e3
-        )
-        rows.append(
-            {
-                "part": name,
-                "ms_median": round(np.median(times), 4),
-                "ms_p95": round(np.quantile(times, 0.95), 4),
-                "seconds_in_a_run": round(share, 2),
-                "machine": cells.machine(),
-            }
-        )
-        print(f"{name:32s} {rows[-1]['ms_median']:8.3f} ms   {share:6.2f} s of a run")
-    cells.write(rows, args.out / "results/training_speed_profile.csv")
+        calls = steps if per_step else steps * settings.num_envs / settings.steps_per_update
+        row = {"part": name, "ms_median": np.median(times), "ms_p95": np.quantile(times, 0.95)}
+        row = rounded(row, 4) | {"seconds_in_a_run": round(np.median(times) * calls / 1e3, 2)}
+        rows.append(row | {"machine": common.machine()})
+    return rows
 
 
 def time_to(rows, quality):
@@ -275,116 +245,85 @@ def time_to(rows, quality):
 
 def runs_of(rows):
     """{variant: list over seeds of the rows of a run}"""
-    found = {}
+    return {name: list(grouped(mine, "seed").values()) for name, mine in grouped(rows, "variant").items()}
+
+
+def last(runs, key):
+    """A column at the ends of runs."""
+    return np.array([float(run[-1][key]) for run in runs])
+
+
+def print_profile(rows):
     for row in rows:
-        found.setdefault(row["variant"], {}).setdefault(row["seed"], []).append(row)
-    return {variant: list(by_seed.values()) for variant, by_seed in found.items()}
+        print(
+            f"{row['part']:32s} {float(row['ms_median']):8.3f} ms   {row['seconds_in_a_run']:>6s} s of a run"
+        )
 
 
-def table(rows):
-    print(
-        f"{'':36s}  robust error %     nominal  seconds  transitions  runs that reach {', '.join(map(str, QUALITIES))} %"
-    )
+def print_runs(rows):
+    qualities = ", ".join(map(str, QUALITIES))
+    head = "robust error %     nominal  seconds  transitions  runs that reach"
+    print(f"{'':36s}  {head} {qualities} %")
     print(f"{'':36s}  IQM [min, max]         IQM   median  per second   (median seconds of those)")
     for variant, runs in runs_of(rows).items():
-        robust, nominal, seconds = (
-            np.array([float(run[-1][key]) for run in runs])
-            for key in ("robust_median_ape", "nominal_median_ape", "train_seconds")
-        )
+        keys = ("robust_median_ape", "nominal_median_ape", "train_seconds", "step")
+        robust, nominal, seconds, steps = (last(runs, key) for key in keys)
         reached = []
         for quality in QUALITIES:
             times = np.array([time_to(run, quality) for run in runs])
             done = np.isfinite(times)
-            reached.append(
-                f"{done.sum()} of {len(runs)}" + (f" ({np.median(times[done]):.0f})" if done.any() else "")
-            )
-        speed = np.median([float(run[-1]["step"]) / float(run[-1]["train_seconds"]) for run in runs])
-        print(
-            f"{variant:36s}  {trim_mean(robust, 0.25):.2f} [{robust.min():.2f}, {robust.max():.2f}]  {trim_mean(nominal, 0.25):6.2f}  "
-            f"{np.median(seconds):7.1f}  {speed:11.0f}  {', '.join(reached)}"
-        )
+            median = f" ({np.median(times[done]):.0f})" if done.any() else ""
+            reached.append(f"{done.sum()} of {len(runs)}{median}")
+        text = f"{trim_mean(robust, 0.25):.2f} [{robust.min():.2f}, {robust.max():.2f}]"
+        text += f"  {trim_mean(nominal, 0.25):6.2f}  {np.median(seconds):7.1f}  {np.median(steps / seconds):11.0f}"
+        print(f"{variant:36s}  {text}  {', '.join(reached)}")
 
 
-def plot(args):
+def plot(ablation, peers, path):
     """Robust error against training time: every variant's end on the left, the curves of ours and of Stable-Baselines3 on the right."""
-    ablation, peers = (
-        cells.read(args.out / f"results/training_speed_{name}.csv") for name in ("ablation", "peer")
-    )
-    fig, axes = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    runs = runs_of(ablation)
+    fig, axes = common.subplots(1, 2, figsize=(10, 4.4))
+    runs, names = runs_of(ablation), []
     for y, (variant, mine) in enumerate(runs.items()):
-        robust = [float(run[-1]["robust_median_ape"]) for run in mine]
-        colour = "#0072B2" if variant == "default" else "#999999"
-        axes[0].plot(robust, [y] * len(robust), "o", color=colour, ms=4, alpha=0.7)
+        robust = last(mine, "robust_median_ape")
+        axes[0].plot(robust, [y] * len(robust), "o", color=BLUE if y == 0 else GREY, ms=4, alpha=0.7)
         axes[0].plot(trim_mean(robust, 0.25), y, "|", color="black", ms=14, mew=2)
-    seconds = {
-        variant: np.median([float(run[-1]["train_seconds"]) for run in mine])
-        for variant, mine in runs.items()
-    }
-    axes[0].set_yticks(
-        range(len(runs)), [f"{variant}  ({seconds[variant]:.0f} s)" for variant in runs], fontsize=8
-    )
+        names.append(f"{variant}  ({np.median(last(mine, 'train_seconds')):.0f} s)")
+    axes[0].set_yticks(range(len(runs)), names, fontsize=8)
     axes[0].invert_yaxis()
-    axes[0].set(
-        xlabel="robust error at the end of a run [%]",
-        title="dots: seeds, bar: interquartile mean; median time",
-    )
-    curves = {"default": ("#0072B2", "-", "this repository")}
-    curves |= {
-        name: (colour, dashes, name)
-        for name, colour, dashes in zip(PEERS, ("#D55E00", "#E69F00"), ("--", "-."))
-    }
-    for variant, (colour, dashes, name) in curves.items():
-        mine = runs_of(ablation + peers).get(variant, [])
-        for i, run in enumerate(mine):
-            x, y = ([float(row[key]) for row in run] for key in ("train_seconds", "robust_median_ape"))
-            axes[1].plot(x, y, color=colour, ls=dashes, lw=1.3, alpha=0.8, label=name if i == 0 else None)
+    axes[0].set_xlabel("robust error at the end of a run [%]")
+    axes[0].set_title("dots: seeds, bar: interquartile mean; median time", fontsize=9)
+    runs |= runs_of(peers)
+    for variant, (colour, dashes) in LINES.items():
+        for i, run in enumerate(runs.get(variant, [])):
+            x, y = column(run, "train_seconds"), column(run, "robust_median_ape")
+            label = None if i else {"default": "this repository"}.get(variant, variant)
+            axes[1].plot(x, y, color=colour, ls=dashes, lw=1.3, alpha=0.8, label=label)
     axes[1].axhline(2.2, color="black", lw=1, ls=":", label="2.2 %")
-    axes[1].set(
-        xscale="log",
-        yscale="log",
-        xlabel="training time on one core [s]",
-        ylabel="robust error [%]",
-        title="a line per seed",
-    )
+    axes[1].set(xscale="log", xlabel="training time on one core [s]", yscale="log", ylabel="robust error [%]")
+    axes[1].set_title("a line per seed", fontsize=9)
     for axis, ticks in ((axes[1].xaxis, (3, 10, 30, 100, 300)), (axes[1].yaxis, (2, 3, 5, 10, 20, 50))):
         axis.set_ticks(ticks, [str(tick) for tick in ticks])
         axis.set_ticks([], minor=True)
     axes[1].legend(fontsize=8, loc="upper right")
     for ax in axes:
         ax.grid(alpha=0.3)
-        ax.title.set_fontsize(9)
-    path = args.out / "figures/training_speed.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
+    common.save(fig, path)
 
 
 def main(args):
-    cells.check(args, f"training_speed_{args.study}.csv", seeds=(1, 1000), seed=(0, 10**9), jobs=(1, 1024))
-    result = args.out / f"results/training_speed_{args.study}.csv"
-    if args.study == "profile":
-        if not args.plot_only:
-            profile(args)
-        return
+    name = f"training_speed_{args.study}"
+    common.check(args, name, seeds=(1, 1000))
     if not args.plot_only:
-        variants = list(VARIANTS if args.study == "ablation" else PEERS)
-        if args.quick:
-            variants = variants[-1:] if args.study == "peer" else variants[:2]
-        seeds = 1 if args.quick else args.seeds if args.study == "ablation" else min(args.seeds, 3)
-        todo = [(variant, args.seed + i, args.quick) for i in range(seeds) for variant in variants]
-        inputs = [
-            ROOT / "sac_her_branching.py",
-            ROOT / "envs/__init__.py",
-            ROOT / "envs/cstr.py",
-        ]
-        rows = cells.collect(ours if args.study == "ablation" else peer, todo, args.jobs, args.runs, inputs)
-        rows.sort(key=lambda row: (variants.index(row["variant"]), int(row["seed"])))
-        cells.write([row | {"jobs": args.jobs, "machine": cells.machine()} for row in rows], result)
-    table(cells.read(result))
-    if all((args.out / f"results/training_speed_{name}.csv").exists() for name in ("ablation", "peer")):
-        plot(args)
+        study = {"ablation": ours, "peer": peers, "profile": profile}[args.study]
+        common.write(study(args), args.table(name))
+    rows = common.read(args.table(name))
+    if args.study == "profile":
+        return print_profile(rows)
+    print_runs(rows)
+    tables = [args.table(f"training_speed_{study}") for study in ("ablation", "peer")]
+    if all(table.exists() for table in tables):
+        plot(*map(common.read, tables), args.figure("training_speed"))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)
