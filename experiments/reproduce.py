@@ -11,7 +11,6 @@ finished step leaves a note under --runs and is not repeated until a script chan
 as well, by the experiment itself. A command that a lost worker leaves behind does no harm: results appear by an atomic rename.
 """
 
-import hashlib
 import json
 import os
 import shutil
@@ -22,18 +21,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from tqdm import tqdm
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
-sys.path.insert(0, str(HERE))
-import cells
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from experiments import common
+from experiments.common import ENVS, HERE, ROOT, SCRIPTS, fail
 
 try:
     import joblib
 except ModuleNotFoundError:
-    cells.fail("joblib is missing; pip install -r requirements-experiments.txt")
+    fail("joblib is missing; pip install -r requirements-experiments.txt")
 
 
 @dataclass(frozen=True)
@@ -44,26 +41,24 @@ class Step:
     minutes: float
     """about how long it takes with one process, for the time left"""
     needs: tuple = ()
-    """names of steps whose results it reads"""
+    """names of steps whose results or agents it reads"""
     alone: bool = False
     """it measures times: nothing else may run"""
+    takes: tuple = ("jobs", "runs")
+    """which of these its script has arguments for"""
 
 
-def experiment(script, study=None, minutes=1.0, needs=(), alone=False):
-    name = f"{script}_{study}" if study else script
-    return Step(
-        name,
-        (f"experiments/{script}.py", *(("--study", study) if study else ())),
-        minutes,
-        tuple(needs),
-        alone,
-    )
+def study(name, script, part=None, minutes=1.0, needs=(), **options):
+    """A script of experiments/, or one of its studies."""
+    command = f"experiments/{script}.py", *(("--study", part) if part else ())
+    return Step(f"{name}_{part}" if part else name, command, minutes, tuple(needs), **options)
 
 
 def training(name, *arguments, minutes=1.0):
     return Step(f"critic_{name}", ("sac_her_branching.py", *arguments), minutes)
 
 
+RUNS = ("runs",)
 CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
 STEPS = [
     training("cstr_robust", "--env", "cstr"),
@@ -71,45 +66,43 @@ STEPS = [
     training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
     training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
     training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
-    experiment("dip_equilibria", minutes=2),
-    experiment("linear_scalability", "main", 15),
-    experiment("linear_scalability", "sweep", 30, ["linear_scalability_main"]),
-    experiment("linear_value_mpc", "train", 70),
-    experiment("linear_value_mpc", "distance", 20, ["linear_value_mpc_train"]),
-    experiment("cstr_training", minutes=25),
-    experiment("cstr_offline", minutes=15),
-    experiment("cstr_offline", "ablation", 40),
-    experiment("cstr_offset_free", "training", 40, ["cstr_offline"]),
-    experiment("cstr_offset_free", "loops", 60, CRITICS),
-    experiment("cstr_tune", minutes=110, needs=CRITICS),
-    experiment("cstr_profile", minutes=1, needs=CRITICS),
-    experiment("cstr_deploy", minutes=60, needs=CRITICS),
-    experiment("cstr_deploy", "critics", 10, CRITICS),
-    experiment("cstr_deploy", "ipopt", 40, CRITICS),
-    experiment("cstr_deploy", "literal", 30, CRITICS),
-    experiment("cstr_deploy", "branching", 5, CRITICS),
-    experiment("cstr_oracle", minutes=90, needs=["cstr_deploy"]),
-    experiment("cstr_frontier", minutes=10, needs=["cstr_oracle"]),
-    experiment("cstr_stuck", minutes=40, needs=CRITICS),
-    experiment("cstr_ablation", minutes=100, needs=["cstr_deploy_critics"]),
-    experiment("cstr_shift", "plants", 50, CRITICS),
-    experiment("cstr_shift", "critic", 4, CRITICS),
-    experiment("reliability", "controllers", 20, CRITICS),
-    experiment("reliability", "training", 10),
-    experiment("reliability", "checkpoints", 2),
-    experiment("reliability", "deployments", 15, CRITICS, alone=True),
-    experiment("reliability", "determinism", 10, CRITICS, alone=True),
-    experiment("dip_performance", minutes=30, alone=True),
-    experiment("linear_value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
-    experiment("linear_value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
-    experiment("solve_time", minutes=10, needs=CRITICS, alone=True),
-    experiment("training_speed", "profile", 1, alone=True),
-    experiment("training_speed", "ablation", 40, ["training_speed_profile"], alone=True),
-    experiment("training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
-    experiment("benchmark_peers", minutes=8, needs=CRITICS, alone=True),
+    study("dip_equilibria", "pendulum/equilibria", minutes=2, takes=()),
+    study("linear_scalability", "linear/scalability", "main", 15),
+    study("linear_scalability", "linear/scalability", "sweep", 30, ["linear_scalability_main"]),
+    study("linear_value_mpc", "linear/value_mpc", "train", 70),
+    study("linear_value_mpc", "linear/value_mpc", "distance", 20, ["linear_value_mpc_train"]),
+    study("cstr_training", "reactor/training", minutes=25),
+    study("cstr_offline", "reactor/offline", minutes=2, needs=["cstr_training"]),
+    study("cstr_offline", "reactor/offline", "ablation", 30, ["cstr_training"]),
+    study("cstr_offset_free", "reactor/offset_free", "training", 40, ["cstr_offline"]),
+    study("cstr_offset_free", "reactor/offset_free", "loops", 60, CRITICS),
+    study("cstr_tune", "reactor/tune", minutes=110, needs=CRITICS),
+    study("cstr_profile", "reactor/trajectories", needs=CRITICS, takes=()),
+    study("cstr_deploy", "reactor/deploy", minutes=60, needs=CRITICS),
+    study("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
+    study("cstr_deploy", "reactor/deploy", "ipopt", 40, CRITICS),
+    study("cstr_deploy", "reactor/deploy", "literal", 30, CRITICS),
+    study("cstr_deploy", "reactor/deploy", "branching", 5, CRITICS),
+    study("cstr_oracle", "reactor/oracle", minutes=90, needs=["cstr_deploy"]),
+    study("cstr_frontier", "reactor/frontier", minutes=10, needs=["cstr_oracle"]),
+    study("cstr_stuck", "reactor/stuck", minutes=40, needs=CRITICS),
+    study("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
+    study("cstr_shift", "reactor/shift", "plants", 50, CRITICS),
+    study("cstr_shift", "reactor/shift", "critic", 4, CRITICS),
+    study("reliability", "trust/reliability", "controllers", 20, CRITICS),
+    study("reliability", "trust/reliability", "training", 10),
+    study("reliability", "trust/reliability", "checkpoints", 2),
+    study("reliability", "trust/reliability", "deployments", 15, CRITICS, alone=True),
+    study("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
+    study("dip_performance", "pendulum/performance", minutes=30, alone=True),
+    study("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
+    study("linear_value_mpc", "linear/value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
+    study("solve_time", "speed/solve_time", minutes=10, needs=CRITICS, alone=True, takes=()),
+    study("training_speed", "speed/training_speed", "profile", 1, alone=True),
+    study("training_speed", "speed/training_speed", "ablation", 40, ["training_speed_profile"], alone=True),
+    study("training_speed", "speed/training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
+    study("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True, takes=RUNS),
 ]
-ONE_AT_A_TIME = {"dip_equilibria", "cstr_profile", "solve_time", "benchmark_peers"}  # take no --jobs
-NOTHING_KEPT = {"dip_equilibria", "cstr_profile", "solve_time"}  # take no --runs
 
 
 @dataclass
@@ -137,60 +130,46 @@ class Args:
 
 def version(quick):
     """Of all code that a step may run, and of the budget."""
-    code = sorted(
-        path
-        for folder in (".", "envs", "envs/control", "envs/agents", "envs/script", "experiments")
-        for path in (ROOT / folder).iterdir()
-        if path.suffix in (".py", ".c") and path.name != Path(__file__).name
-    )
-    return hashlib.sha256(b"".join(path.read_bytes() for path in code) + bytes([quick])).hexdigest()[:12]
+    return common.digest([*SCRIPTS, ENVS, HERE], quick)
 
 
 def note(step, args):
     return args.runs / f"done/{step.name}_{version(args.quick)}.json"
 
 
-def run(step, args):
-    """One step, in a process of its own. Returns its name and what went wrong, or None."""
-    if note(step, args).exists():
+def write(text, path):
+    """A file that appears whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+
+
+def run(step, args, done):
+    """One step, in a process of its own, unless its note `done` is there. Returns its name and what went wrong, or None."""
+    if done.exists():
         return step.name, None
-    tick, script = time.time(), Path(step.command[0]).stem
+    tick, critic = time.time(), step.name.startswith("critic_")
     command = [sys.executable, *step.command]
-    if step.name.startswith("critic_"):
+    if critic:
         trained = args.runs / f"critics/{step.name}_{os.getpid()}"
-        command += [
-            "--out",
-            str(trained),
-            *(["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else []),
-        ]
+        command += ["--out", str(trained)]
+        command += ["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else []
     else:
-        command += ["--out", str(args.out), *(["--quick"] if args.quick else [])]
-        command += [] if script in ONE_AT_A_TIME else ["--jobs", str(args.step_jobs)]
-        shared = (
-            "cstr_loops"
-            if script.startswith("cstr_")
-            and script not in ("cstr_offline", "cstr_training", "cstr_offset_free")
-            else script
-        )
-        command += [] if script in NOTHING_KEPT else ["--runs", str(args.runs / shared)]
-    result = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
-    )
+        command += ["--out", str(args.out)] + ["--quick"] * args.quick
+        command += ["--jobs", str(args.step_jobs)] if "jobs" in step.takes else []
+        command += ["--runs", str(args.runs / "experiments")] if "runs" in step.takes else []
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", env=one_thread)
     if result.returncode:
         return step.name, f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
-    if step.name.startswith("critic_"):
+    if critic:
         target = args.out / f"pretrained/{step.name.removeprefix('critic_')}.pt"
         target.parent.mkdir(parents=True, exist_ok=True)
         next(trained.glob("*/checkpoint.pt")).replace(target)
         shutil.rmtree(trained)
-    for path, text in (
-        (args.runs / f"logs/{step.name}.txt", result.stdout),
-        (note(step, args), json.dumps({"seconds": time.time() - tick})),
-    ):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(f".{os.getpid()}")
-        temporary.write_text(text)
-        temporary.replace(path)
+    write(result.stdout, args.runs / f"logs/{step.name}.txt")
+    write(json.dumps({"seconds": time.time() - tick}), done)
     return step.name, None
 
 
@@ -221,69 +200,80 @@ def waves(steps):
         left = [step for step in left if step.name not in done]
 
 
-def main(args, steps=STEPS):
+def checked(args):
+    """The arguments with their folders, which are made. Refuses what cannot work."""
     for name in ("jobs", "step_jobs"):
         if not 1 <= getattr(args, name) <= 1024:
-            cells.fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in 1 to 1024")
+            fail(f"--{name.replace('_', '-')} is {getattr(args, name)}; it must lie in 1 to 1024")
     if (args.backend == "dask") != bool(args.scheduler):
-        cells.fail("--backend dask and --scheduler ADDRESS belong together")
-    args.out = args.out or (ROOT / "runs/quick" if args.quick else HERE)
-    if args.quick and args.out.resolve() == HERE:
-        cells.fail(
+        fail("--backend dask and --scheduler ADDRESS belong together")
+    out = args.out or (ROOT / "runs/quick" if args.quick else HERE)
+    if args.quick and out.resolve() == HERE:
+        fail(
             "--quick would replace the committed results by those of tiny budgets; name another folder with --out"
         )
-    args.runs, args.out = args.runs.absolute(), args.out.absolute()
+    args = replace(args, runs=args.runs.absolute(), out=out.absolute())
     try:
-        steps = wanted(steps, args.only)
         for folder in (args.runs, args.out):
             folder.mkdir(parents=True, exist_ok=True)
-    except ValueError as error:
-        cells.fail(error)
     except OSError as error:
-        cells.fail(f"--runs {args.runs} or --out {args.out}: cannot write there ({error.strerror})")
+        fail(f"--runs {args.runs} or --out {args.out}: cannot write there ({error.strerror})")
+    return args
+
+
+def print_list(steps, args):
+    for step in steps:
+        state = "done" if note(step, args).exists() else f"{step.minutes:g} min"
+        needs = "the reactor's critics" if step.needs == CRITICS else ", ".join(step.needs)
+        needs = f"needs {needs}" if needs else ""
+        print(f"{step.name:28s}{state:>8s}  {'alone' if step.alone else '':7s}{needs}")
+    left = [step for step in steps if not note(step, args).exists()]
+    hours = sum(step.minutes / (1 if step.alone else args.jobs) for step in left) / 60
+    print(f"minutes of one process; about {hours:.1f} hours are left with --jobs {args.jobs}")
+
+
+def run_all(steps, args):
+    """Every step, wave by wave, until one fails; returns what went wrong."""
+    settings = dict(backend="dask") if args.backend == "dask" else dict(backend="loky", n_jobs=args.jobs)
+    minutes, failed = {step.name: step.minutes for step in steps}, []
+    layout = "{l_bar}{bar}| {remaining} left{postfix}"
+    with tqdm(total=sum(minutes.values()), disable=None, bar_format=layout) as bar:
+        for wave in waves(steps):
+            with joblib.parallel_config(**settings):
+                calls = (joblib.delayed(run)(step, args, note(step, args)) for step in wave)
+                for name, error in joblib.Parallel(return_as="generator_unordered")(calls):
+                    bar.set_postfix_str(f", {name} {'failed' if error else 'done'}")
+                    bar.update(minutes[name])
+                    failed += [f"{name}: {error}"] if error else []
+            if failed:
+                break
+    return failed
+
+
+def main(args, steps=STEPS):
+    args = checked(args)
+    try:
+        steps = wanted(steps, args.only)
+    except ValueError as error:
+        fail(error)
     if args.quick:  # whose times mean nothing
         steps = [replace(step, alone=False) for step in steps]
     if args.list:
-        for step in steps:
-            state = "done" if note(step, args).exists() else f"{step.minutes:g} min"
-            needs = "the reactor's critics" if step.needs == CRITICS else ", ".join(step.needs)
-            print(
-                f"{step.name:28s}{state:>8s}  {'alone  ' if step.alone else '':7s}{'needs ' + needs if needs else ''}"
-            )
-        left = [step for step in steps if not note(step, args).exists()]
-        hours = sum(step.minutes / (1 if step.alone else args.jobs) for step in left) / 60
-        print(f"minutes of one process; about {hours:.1f} hours are left with --jobs {args.jobs}")
-        return
-    settings = dict(backend="loky", n_jobs=args.jobs)
+        return print_list(steps, args)
     if args.backend == "dask":
         from dask.distributed import Client
 
         try:
             client = Client(args.scheduler, timeout=20)  # joblib's dask backend finds it
         except (OSError, ValueError) as error:
-            cells.fail(f"--scheduler {args.scheduler} does not answer ({error})")
-        settings = dict(backend="dask")
-    minutes, failed = {step.name: step.minutes for step in steps}, []
-    with tqdm(
-        total=sum(minutes.values()), disable=None, bar_format="{l_bar}{bar}| {remaining} left{postfix}"
-    ) as bar:
-        for wave in waves(steps):
-            with joblib.parallel_config(**settings):
-                results = joblib.Parallel(return_as="generator_unordered")(
-                    joblib.delayed(run)(step, args) for step in wave
-                )
-                for name, error in results:
-                    bar.set_postfix_str(f", {name} {'failed' if error else 'done'}")
-                    bar.update(minutes[name])
-                    failed += [f"{name}: {error}"] if error else []
-            if failed:
-                break
+            fail(f"--scheduler {args.scheduler} does not answer ({error})")
+    failed = run_all(steps, args)
     if args.backend == "dask":
         client.close()
     if failed:
-        cells.fail("\n\n".join(failed))
+        fail("\n\n".join(failed))
     print(f"{len(steps)} steps done; results in {args.out}")
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

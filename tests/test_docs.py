@@ -17,10 +17,9 @@ import tyro
 import goal_mpc
 import rl_mpc_deploy
 import sac_her_branching
+from experiments import reproduce
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import reproduce  # noqa: E402
 
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text()
@@ -32,10 +31,10 @@ SCRIPTS = {
     "rl_mpc_deploy.py": rl_mpc_deploy,
 }
 SOURCES = [
-    path
-    for folder in (".", "envs", "envs/control", "envs/agents", "envs/script", "experiments")
-    for path in sorted((ROOT / folder).glob("*.py"))
+    path for pattern in ("*.py", "envs/**/*.py", "experiments/**/*.py") for path in sorted(ROOT.glob(pattern))
 ]
+
+PLACES = ROOT, ROOT / "envs", ROOT / "experiments", *(ROOT / "experiments").glob("*/")
 
 
 def commands():
@@ -44,7 +43,9 @@ def commands():
     texts += [path.read_text() for path in (ROOT / "experiments/pretrained").glob("*.txt")]
     found = {}
     for text in texts:
-        for script, words in re.findall(r"python ((?:experiments/)?\w+\.py)((?: +[^\s`#&)]+)*)", text):
+        for script, words in re.findall(
+            r"python ((?:experiments/(?:\w+/)?)?\w+\.py)((?: +[^\s`#&)]+)*)", text
+        ):
             found[script, " ".join(words.split())] = None
     return [(script, shlex.split(words)) for script, words in found]
 
@@ -101,7 +102,7 @@ def interrupted(folder):
 def test_every_command_of_an_experiment_is_a_step_of_the_reproduction(command):
     """Which runs all of them, on tiny budgets, in test_experiments.py; here their arguments are read."""
     script, words = command
-    module = importlib.import_module(Path(script).stem)
+    module = importlib.import_module(script.removesuffix(".py").replace("/", "."))
     args = tyro.cli(module.Args, args=words)
     assert (ROOT / script).exists()
     if script != "experiments/reproduce.py":
@@ -160,8 +161,7 @@ def test_links_files_and_figures_exist():
             assert target.startswith("http") or (folder / target).exists(), (page, target)
         for path in re.findall(r"`([\w/]+\.(?:py|pt|txt|csv|png|gif|npz))`", text):
             if "NAME" not in path and ("/" in path or path.endswith(".py")) and "quadruple_tank" not in path:
-                places = (ROOT, ROOT / "envs", ROOT / "experiments")
-                assert any((place / path).exists() for place in places), (page, path)
+                assert any((place / path).exists() for place in PLACES), (page, path)
 
 
 def test_anchors_exist():
@@ -190,11 +190,7 @@ def test_arguments_and_names_of_the_code_that_pages_mention_exist():
             name = argument.removeprefix("no-").replace("-", "_")
             assert name in fields or argument.replace("-", "_") in fields, (page, argument)
         for path, name in re.findall(r"`([\w/]+\.py):([\w.]+)`", text):
-            source = next(
-                place / path
-                for place in (ROOT, ROOT / "envs", ROOT / "experiments")
-                if (place / path).exists()
-            )
+            source = next(place / path for place in PLACES if (place / path).exists())
             defined = {
                 node.name
                 for node in ast.walk(ast.parse(source.read_text()))

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import tyro
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import reproduce  # noqa: E402
+from experiments import reproduce
 
+ROOT = Path(__file__).parent.parent
 TABLES = sorted(path.name for path in (ROOT / "experiments/results").glob("*.csv"))
 FIGURES = sorted(path.name for path in (ROOT / "experiments/figures").iterdir())
 # measured with the planner before the present one: their columns may differ, and figures that need the new ones are not redrawn
@@ -106,11 +105,9 @@ def test_what_is_finished_is_not_repeated(quick):
     assert f"{len(reproduce.STEPS)} steps done" in run(
         "reproduce", "--quick", "--out", quick, "--runs", quick / "runs"
     )
-    for name, study, folder in (
-        ("cstr_deploy", "deploy", "cstr_loops"),
-        ("linear_value_mpc", "train", "linear_value_mpc"),
-    ):
-        run(name, "--study", study, "--quick", "--jobs", 1, "--out", quick, "--runs", quick / "runs" / folder)
+    for name, study in (("reactor/deploy", "deploy"), ("linear/value_mpc", "train")):
+        kept = quick / "runs/experiments"
+        run(name, "--study", study, "--quick", "--jobs", 1, "--out", quick, "--runs", kept)
     assert before == written()
 
 
@@ -123,7 +120,7 @@ DRAWN = [step for step in DRAWN if step.name not in TABLE_ALONE | NOT_REDRAWN]
 @pytest.mark.parametrize("step", DRAWN, ids=lambda step: step.name)
 def test_figures_are_drawn_from_the_committed_tables(step, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
-    module = importlib.import_module(Path(step.command[0]).stem)
+    module = importlib.import_module(step.command[0].removesuffix(".py").replace("/", "."))
     module.main(tyro.cli(module.Args, args=[*step.command[1:], "--plot-only", "--out", str(tmp_path)]))
     plt.close("all")
     assert all(path.stat().st_size > 10_000 for path in (tmp_path / "figures").iterdir())
@@ -154,7 +151,7 @@ def test_training_beside_its_peer_counts_what_both_did(quick):
 def test_agents_are_needed_before_their_closed_loops(tmp_path):
     command = [
         sys.executable,
-        "experiments/linear_value_mpc.py",
+        "experiments/linear/value_mpc.py",
         "--runs",
         str(tmp_path),
         "--out",
@@ -167,12 +164,12 @@ def test_agents_are_needed_before_their_closed_loops(tmp_path):
 @pytest.mark.parametrize(
     "name, arguments, words",
     [
-        ("linear_scalability", ["--jobs", "0"], ["--jobs", "0"]),
-        ("linear_scalability", ["--systems", "0"], ["--systems", "0"]),
-        ("linear_value_mpc", ["--horizon", "0"], ["--horizon", "0"]),
-        ("linear_value_mpc", ["--study", "train", "--dim", "600"], ["--dim", "600"]),
-        ("linear_value_mpc", ["--plot-only", "--out", "{}"], ["--plot-only", "does not exist"]),
-        ("linear_value_mpc", ["--out", "README.md/x"], ["--out", "cannot write"]),
+        ("linear/scalability", ["--jobs", "0"], ["--jobs", "0"]),
+        ("linear/scalability", ["--systems", "0"], ["--systems", "0"]),
+        ("linear/value_mpc", ["--horizon", "0"], ["--horizon", "0"]),
+        ("linear/value_mpc", ["--study", "train", "--dim", "600"], ["--dim", "600"]),
+        ("linear/value_mpc", ["--plot-only", "--out", "{}"], ["--plot-only", "does not exist"]),
+        ("linear/value_mpc", ["--out", "README.md/x"], ["--out", "cannot write"]),
     ],
 )
 def test_bad_arguments_get_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
@@ -205,23 +202,22 @@ def test_the_oracle_is_no_worse_than_any_controller():
 
 
 def test_the_tuned_benchmark_is_the_best_of_its_table():
-    import cstr_tune
+    from experiments.reactor import tune
 
     rows = list(csv.DictReader(open(ROOT / "experiments/results/cstr_tune.csv")))
-    for solver, tuned in (("anytime", cstr_tune.TUNED), ("IPOPT", cstr_tune.TUNED_IPOPT)):
+    for solver, tuned in (("anytime", tune.TUNED), ("IPOPT", tune.TUNED_IPOPT)):
         mine = [row for row in rows if row.get("solver", "IPOPT") == solver]
         assert mine or "cstr_tune" in EARLIER
         if mine:
-            assert cstr_tune.GRID[max(mine, key=lambda row: float(row["score"]))["variant"]] == tuned
+            assert tune.GRID[max(mine, key=lambda row: float(row["score"]))["variant"]] == tuned
 
 
 def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
-    import cstr_oracle
-
     from envs import cstr
+    from experiments.reactor import oracle
 
     problem, x0, psi = (
-        cstr_oracle.Oracle(20, compile=False),
+        oracle.Oracle(20, compile=False),
         np.array([0.8, 0.4, 120.0, 118.0]),
         np.array([1.02, 0.95]),
     )
@@ -229,22 +225,23 @@ def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
     u = problem.optimum(x0, psi, 5.0, guess)
     assert ((cstr.U_LOW - 1e-6 <= u) & (u <= cstr.U_HIGH + 1e-6)).all()
     (near, _, slack), (near_guess, _, slack_guess) = (
-        cstr_oracle.measure(x0, psi, actions) for actions in (u, guess)
+        oracle.measure(x0, psi, actions) for actions in (u, guess)
     )
     assert near - 5 * slack > near_guess - 5 * slack_guess
     assert -problem.objective == pytest.approx(near - 5 * slack, abs=1e-4)  # the model is the plant
 
 
 def test_a_critic_per_scenario_equals_twin_critics_one_by_one():
-    """cstr_offline.py's critics, all evaluated at once, against TwinCritic for each pair."""
-    import cstr_offline
+    """offline.py's critics, all evaluated at once, against TwinCritic for each pair."""
     import torch
 
+    from experiments.reactor import offline
+
     network = dict(n_in=5, n_u=2, hidden=[8, 8])
-    many, z, a = cstr_offline.ManyCritics(3, **network), torch.randn(3, 4, 5), torch.randn(3, 4, 2)
+    many, z, a = offline.ManyCritics(3, **network), torch.randn(3, 4, 5), torch.randn(3, 4, 2)
     together, alone = many.each(z, a), many.each(z[0], a[0])
     for i in range(3):
-        twin = cstr_offline.sac.TwinCritic(**network)
+        twin = offline.sac.TwinCritic(**network)
         twin.load_state_dict({k: v[2 * i : 2 * i + 2] for k, v in many.state_dict().items()})
         torch.testing.assert_close(together[i], twin(z[i], a[i]))
         torch.testing.assert_close(alone[i], twin(z[0], a[0]))

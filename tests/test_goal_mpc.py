@@ -258,8 +258,7 @@ def test_hard_bounds_hold_in_a_tree_from_the_first_prediction_on():
 
 
 def test_the_guides_closed_loop_is_the_first_guess():
-    sys.path.insert(0, str(ROOT / "experiments"))
-    from dip_performance import Guided
+    from experiments.pendulum.performance import Guided
 
     guide, mpc = pendulum(4), pendulum(8, kind=Guided)
     mpc.guide = guide

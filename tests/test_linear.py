@@ -21,10 +21,9 @@ import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import linear
 from envs.control import linear_systems
+from experiments.linear import scalability as study
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import linear_scalability as study
 
 GAMMAS = (0.3, 0.9, 0.99, 1.0)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs import cstr
-from experiments.literal import LiteralMPC
+from experiments.reactor.literal import LiteralMPC
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SOLUTIONS = {

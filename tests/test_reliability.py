@@ -1,9 +1,8 @@
-"""Faults, hostile files and command lines: what experiments/reliability.py counts, on tiny budgets, and a fuzzer over the arguments."""
+"""Faults, hostile files and command lines: what trust/reliability.py counts, on tiny budgets, and a fuzzer over the arguments."""
 
 import csv
 import dataclasses
 import string
-import sys
 import typing
 from pathlib import Path
 
@@ -16,10 +15,9 @@ from hypothesis import strategies as st
 import goal_mpc
 import rl_mpc_deploy
 import sac_her_branching
+from experiments.trust import reliability
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import reliability  # noqa: E402
 
 SCRIPTS = [goal_mpc, rl_mpc_deploy, sac_her_branching]
 NUMBERS = st.one_of(
@@ -111,14 +109,14 @@ def test_any_file_is_a_checkpoint_or_refused_in_one_sentence(data, checkpoint, t
         where[data.draw(st.sampled_from(sorted(where)))] = data.draw(plain)
         torch.save(content, path)
     for load in reliability.LOADERS:
-        assert not reliability.read(load, path)["wrong"]
+        assert not reliability.verdict(load, path)["wrong"]
 
 
 def test_code_in_a_checkpoint_is_not_run(capsys, checkpoint, tmp_path):
     data = torch.load(checkpoint, weights_only=True) | {"actor": reliability.Code()}
     torch.save(data, tmp_path / "evil.pt")
     for load in reliability.LOADERS:
-        assert reliability.read(load, tmp_path / "evil.pt") == {"refused": 1}
+        assert reliability.verdict(load, tmp_path / "evil.pt") == {"refused": 1}
     with pytest.raises(ValueError, match="resume.pt"):
         sac_her_branching.main(sac_her_branching.Args(resume=tmp_path / "evil.pt"))
     assert reliability.Code().__reduce__()[1][0] not in capsys.readouterr().out

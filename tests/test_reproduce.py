@@ -3,16 +3,15 @@
 import json
 import os
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from experiments import reproduce
+
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "experiments"))
-import reproduce  # noqa: E402
 
 # notes when it began in a file of its own, works for a while, writes a result
 WORK = """
@@ -46,14 +45,15 @@ def started(settings):
 def test_every_table_and_figure_has_a_step():
     """Each script with a figure or a table of its own is run, with every study it knows."""
     commands = {" ".join(step.command) for step in reproduce.STEPS}
-    for path in (ROOT / "experiments").glob("*.py"):
+    for path in (ROOT / "experiments").glob("*/*.py"):
         text = path.read_text()
-        if "class Args" not in text or path.stem == "reproduce":
+        if "class Args" not in text:
             continue
         line = next((line for line in text.splitlines() if "study: Literal[" in line), None)
         studies = json.loads(line[line.index("[") : line.index("]") + 1]) if line else [None]
         for study in studies:
-            plain, named = f"experiments/{path.name}", f"experiments/{path.name} --study {study}"
+            plain = path.relative_to(ROOT).as_posix()
+            named = f"{plain} --study {study}"
             assert named in commands or (study in (None, studies[0]) and plain in commands), named
     trained = {
         step.name.removeprefix("critic_") for step in reproduce.STEPS if step.name.startswith("critic_")

@@ -19,7 +19,7 @@ import casadi as ca
 import do_mpc
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 
 

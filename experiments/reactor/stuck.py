@@ -1,7 +1,7 @@
 """Why robust MPC stays where it is: one problem under two solvers, each given the other's plan, and IPOPT with other Hessians and barriers.
 
-    python experiments/cstr_stuck.py --jobs 2        # half an hour; continues where it stopped
-    python experiments/cstr_stuck.py --plot-only     # print the table of the committed CSV
+    python experiments/reactor/stuck.py --jobs 2        # half an hour; continues where it stopped
+    python experiments/reactor/stuck.py --plot-only     # print the table of the committed CSV
 
 The problem is that of rl_mpc_deploy.py's robust MPC, N = 20 with quadratic cost, hard bounds as exact penalties; objectives are the same
 number for the same plan. Closed loops on paired draws:
@@ -21,40 +21,25 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import tyro
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
-import cells
-import cstr_loops as loops
-import literal
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import rl_mpc_deploy as deploy
 from envs import cstr
+from envs.script.comparison import draws, run_episode
+from experiments import common
+from experiments.common import column, distinct, rounded
+from experiments.reactor import literal, loops
 
-PRICE = np.minimum(len(cstr.SCENARIOS["mpc"]) * cstr.BENCHMARK["slack_price"], deploy.HARD_PRICE)
-PROBLEM = dict(
-    goal=cstr.EVAL_GOAL, robust_horizon=1, slack_price=PRICE, change_weight=cstr.BENCHMARK["change_weight"]
-)
+SCENARIOS, BENCHMARK = cstr.SCENARIOS["mpc"], cstr.BENCHMARK
+OPTIONS = dict(goal=cstr.EVAL_GOAL, robust_horizon=1, change_weight=BENCHMARK["change_weight"])
+OPTIONS |= dict(slack_price=np.minimum(len(SCENARIOS) * BENCHMARK["slack_price"], deploy.HARD_PRICE))
 NEAR = 50.0  # below it IPOPT counts as stuck
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True)
+class Args(common.ParallelArgs):
     episodes: int = 20
     """paired draws"""
-    seed: int = 0
-    """seed of the draws, that of cstr_deploy.py"""
-    jobs: int = 2
-    """processes"""
-    quick: bool = False
-    """2 draws of 3 steps: a smoke test"""
-    plot_only: bool = False
-    """print the table of the CSV"""
-    runs: Path = Path("runs/cstr_loops")
-    """where finished draws are kept, so that a second call continues"""
-    out: Path = HERE
-    """folder whose results/ is written"""
 
 
 class GaussNewton(literal.IpoptMPC):
@@ -62,14 +47,11 @@ class GaussNewton(literal.IpoptMPC):
         oracle = super().build_solvers(compile, options)["cold"].oracle()
         w, p, f, g = (self.problem[name] for name in "xpfg")
         factor, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
-        hessian = ca.Function(
-            "nlp_hess_l", [w, p, factor, multipliers], [ca.triu(ca.hessian(factor * f, w)[0])]
-        )
-        common = {"print_time": False, "show_eval_warnings": False, "hess_lag": hessian}
+        hessian = ca.triu(ca.hessian(factor * f, w)[0])
+        hessian = ca.Function("nlp_hess_l", [w, p, factor, multipliers], [hessian])
+        shared = {"print_time": False, "show_eval_warnings": False, "hess_lag": hessian}
         ipopt = {"cold": self.cold | options, "warm": self.cold | options | self.warm}
-        return {
-            name: ca.nlpsol(name, "ipopt", oracle, common | {"ipopt": given}) for name, given in ipopt.items()
-        }
+        return {name: ca.nlpsol(name, "ipopt", oracle, shared | {"ipopt": ipopt[name]}) for name in ipopt}
 
 
 class Second:
@@ -94,16 +76,11 @@ class IpoptSecond(Second, literal.IpoptMPC):
     def make_step(self, x0):
         actions = self.actions(x0)
         w = self.tree_guess(x0, lambda t, x: actions[t])
-        guess_cost, self.found, self.plan = (
-            self.cost(x0, w),
-            None,
-            (w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"]))),
-        )
+        self.found, self.plan = None, (w, np.zeros(len(w)), np.zeros(len(self.limits["lbg"])))
+        guess_cost = self.cost(x0, w)
         u = super().make_step(x0)
-        self.stats |= {
-            "guess_cost": guess_cost,
-            "cost": guess_cost if self.stats["fell_back"] else self.objective,
-        }
+        cost = guess_cost if self.stats["fell_back"] else self.objective
+        self.stats |= {"guess_cost": guess_cost, "cost": cost}
         return u
 
 
@@ -128,39 +105,26 @@ def controller(experiment, horizon, compile):
     kind, options = EXPERIMENTS[experiment]
     if "other" in options:
         options = {"other": controller(options["other"], horizon, compile)}
-    return kind(
-        cstr,
-        horizon,
-        cstr.SCENARIOS["mpc"],
-        literal.squared_error(cstr),
-        compile=compile,
-        **PROBLEM,
-        **options,
-    )
+    options = OPTIONS | options | dict(compile=compile)
+    return kind(cstr, horizon, SCENARIOS, literal.squared_error(cstr), **options)
 
 
 def run(cell):
     """A row: one experiment on one draw."""
     experiment, seed, episode, steps, *problem = cell
-    recorder, (starts, psi) = (
-        loops.Recorder(controller(experiment, *problem)),
-        deploy.draws(cstr, episode + 1, seed),
-    )
-    _, _, row = deploy.run_episode(recorder, cstr, starts[episode], psi[episode], cstr.EVAL_GOAL, steps)
+    recorder = loops.Recorder(controller(experiment, *problem))
+    starts, psi = draws(cstr, episode + 1, seed)
+    _, _, row = run_episode(recorder, cstr, starts[episode], psi[episode], cstr.EVAL_GOAL, steps)
     gain = [stats["guess_cost"] - stats["cost"] for stats in recorder.log if "guess_cost" in stats]
     row |= {"gain": np.median(gain or [0.0]), "unsolved": recorder.counts()["unsolved"]}
-    row = {key: round(float(value), 6) if isinstance(value, float) else value for key, value in row.items()}
-    return [{"variant": experiment, "seed": seed, "episode": episode} | row]
+    return [{"variant": experiment, "seed": seed, "episode": episode} | rounded(row, 6)]
 
 
 def print_table(rows):
-    stuck = {
-        row["episode"] for row in rows if row["variant"] == "IPOPT" and float(row["time_near_goal"]) < NEAR
-    }
-    draws = len({row["episode"] for row in rows})
-    print(
-        f"medians over the {len(stuck)} of {draws} draws in which IPOPT is near the goal for less than {NEAR:g} steps"
-    )
+    near = {row["episode"]: float(row["time_near_goal"]) for row in rows if row["variant"] == "IPOPT"}
+    stuck, draws = [row for row in rows if near[row["episode"]] < NEAR], len(near)
+    which = f"{len(distinct(stuck, 'episode'))} of {draws} draws"
+    print(f"medians over the {which} in which IPOPT is near the goal for less than {NEAR:g} steps")
     columns = (
         "time_near_goal",
         "time_outside_constraints",
@@ -171,27 +135,20 @@ def print_table(rows):
     )
     print(f"{'':32s}" + "".join(f"{name.replace('_', ' '):>26s}" for name in columns))
     for label in EXPERIMENTS:
-        mine = [row for row in rows if row["variant"] == label and row["episode"] in stuck]
-        print(
-            f"{label:32s}"
-            + "".join(f"{np.median([float(row[name]) for row in mine]):26.4g}" for name in columns)
-        )
+        medians = (np.median(column(stuck, name, variant=label)) for name in columns)
+        print(f"{label:32s}" + "".join(f"{median:26.4g}" for median in medians))
 
 
 def main(args):
-    cells.check(args, "cstr_stuck.csv", episodes=(1, 10**6), seed=(0, 10**9), jobs=(1, 1024))
-    table = args.out / "results/cstr_stuck.csv"
+    common.check(args, "cstr_stuck", episodes=(1, 10**6))
     if not args.plot_only:
-        episodes, steps = (2, 3) if args.quick else (args.episodes, 100)
-        problem = (3, False) if args.quick else (cstr.BENCHMARK["horizon"], True)
-        todo = [
-            (label, args.seed, episode, steps, *problem)
-            for label in EXPERIMENTS
-            for episode in range(episodes)
-        ]
-        cells.write(cells.collect(run, todo, args.jobs, args.runs, [Path(__file__), *loops.INPUTS]), table)
-    print_table(cells.read(table))
+        usual = args.episodes, 100, BENCHMARK["horizon"], True
+        episodes, steps, *problem = (2, 3, 3, False) if args.quick else usual
+        todo = [(label, args.seed, i, steps, *problem) for label in EXPERIMENTS for i in range(episodes)]
+        rows = common.collect(run, todo, args.runs, args.jobs, uses=[loops, literal])
+        common.write(rows, args.table("cstr_stuck"))
+    print_table(common.read(args.table("cstr_stuck")))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

@@ -1,6 +1,6 @@
 """What happens when things go wrong, counted: faults in closed loops, killed trainings, hostile checkpoints, many deployments, two runs.
 
-    python experiments/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
+    python experiments/trust/reliability.py --study controllers      # or training, checkpoints, deployments, determinism
 
 controllers: closed loops over random starts, goals and plants, and the same with a fault at every fourth step: numbers that are not
 finite in the measurement or in the previous plan, states far outside the box, a solver stopped after one iteration (goal_mpc.py: three) or
@@ -21,7 +21,6 @@ import io
 import re
 import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -33,37 +32,31 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
-sys.path.insert(0, str(ROOT))
-import cells
-import reproduce
-
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 import sac_her_branching as sac
 from envs.agents.checkpoint import MAX_CHECKPOINT_BYTES
 from envs.control.expansion import torch_value
+from experiments import common, reproduce
+from experiments.common import ROOT, without
 
 EPISODE = 25  # steps
-IPOPT = {  # goal_mpc.py's
+CONTROLLERS = {  # arguments of goal_mpc.py, or name and arguments of rl_mpc_deploy.py
+    "RL+MPC, N = 5": ("rl_mpc", deploy.Args()),
+    "RL+MPC, offset-free": ("rl_mpc", deploy.Args(offset_free=True)),
+    "RL+MPC, N = 0": ("rl_mpc", deploy.Args(horizon=0)),
+    "RL+MPC, linear, n = 32": ("rl_mpc", deploy.Args(env="linear", horizon=3)),
+    "actor": ("actor", deploy.Args()),
+    "nominal MPC": ("nominal_mpc", deploy.Args()),
+    "robust MPC": ("robust_mpc", deploy.Args()),
     "goal_mpc.py, reactor": gm.Args(env="cstr", horizon=10, robust_horizon=1),
     "goal_mpc.py, pendulum": gm.Args(horizon=20),
 }
-CONTROLLERS = {
-    "RL+MPC, N = 5": lambda: deploy.build_controller("rl_mpc", deploy.Args()),
-    "RL+MPC, offset-free": lambda: deploy.build_controller("rl_mpc", deploy.Args(offset_free=True)),
-    "RL+MPC, N = 0": lambda: deploy.build_controller("rl_mpc", deploy.Args(horizon=0)),
-    "RL+MPC, linear, n = 32": lambda: deploy.build_controller("rl_mpc", deploy.Args(env="linear", horizon=3)),
-    "actor": lambda: deploy.build_controller("actor", deploy.Args()),
-    "nominal MPC": lambda: deploy.build_controller("nominal_mpc", deploy.Args()),
-    "robust MPC": lambda: deploy.build_controller("robust_mpc", deploy.Args()),
-} | {name: lambda settings=settings: gm.build_controller(settings) for name, settings in IPOPT.items()}
 PLANS = [name for name in CONTROLLERS if name not in ("actor", "RL+MPC, N = 0")]  # have a solver and a plan
-ANYTIME = [name for name in PLANS if name not in IPOPT]
+ANYTIME = [name for name in PLANS if not name.startswith("goal_mpc.py")]
 FAULTS = {  # case: controllers that it can befall
     "random": list(CONTROLLERS),
     "plan not finite": PLANS,
@@ -83,55 +76,41 @@ ANSWERS = {
 }  # rungs of goal_mpc.py
 STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 1,000
 CELL = 500  # steps
-COUNTS = (
-    "faults",
-    "refused",
-    "wrong",
-    "cost_rose",
-    "chances",
-    "recovered",
-    "planned",
-    "fell_back",
-    "held",
-    "qp_unsolved",
-)
-TIMES = re.compile(
-    r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$"
-)  # columns that may differ from run to run
+COUNTS = "faults refused wrong cost_rose chances recovered planned fell_back held qp_unsolved".split()
+# columns that may differ from run to run
+TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True)
+class Args(common.ParallelArgs):
     study: Literal["controllers", "training", "checkpoints", "deployments", "determinism"] = "controllers"
     """what to break"""
-    jobs: int = 2
-    """processes; the results do not depend on it"""
-    quick: bool = False
-    """tiny budgets: a smoke test"""
-    plot_only: bool = False
-    """print the committed table"""
-    runs: Path = Path("runs/reliability")
-    """where finished parts are kept"""
-    out: Path = HERE
-    """folder whose results/ are written"""
 
 
 # Closed loops
 
 
 class Hasty(gm.ScenarioMPC):
-    """Its solvers stop after three iterations."""
+    """goal_mpc.py's controller with a second pair of solvers, which stop after three iterations: they solve while `early` is set."""
 
-    cold = gm.ScenarioMPC.cold | {"max_iter": 3}
+    early = False
+
+    def build_solvers(self, compile, options):
+        usual = super().build_solvers(compile, options)
+        early = super().build_solvers(compile, options | {"max_iter": 3})
+        return usual | {f"early {name}": solver for name, solver in early.items()}
+
+    def solve(self, which, *arguments):
+        return super().solve(f"early {which}" if self.early else which, *arguments)
 
 
 @cache
 def built(name):
-    """A controller, and of goal_mpc.py's the solvers that stop early."""
     torch.set_num_threads(1)
-    if name in IPOPT:
-        return gm.build_controller(IPOPT[name]), gm.build_controller(IPOPT[name], Hasty).solvers
-    return CONTROLLERS[name](), None
+    settings = CONTROLLERS[name]
+    if isinstance(settings, gm.Args):
+        return gm.build_controller(settings, Hasty)
+    return deploy.build_controller(*settings)
 
 
 def draw(plant, rng):
@@ -156,10 +135,8 @@ def spoil(controller, case, x, rng):
         bad[rng.integers(len(x))] = True
         return np.where(bad, rng.choice([np.nan, np.inf, -np.inf]), x)
     if case == "state far outside":
-        reach = 10.0 ** rng.uniform(1, 12)
-        return x + reach * rng.uniform(-1, 1, size=x.shape) * (
-            controller.plant.INIT_HIGH - controller.plant.INIT_LOW
-        )
+        reach, width = 10.0 ** rng.uniform(1, 12), controller.plant.INIT_HIGH - controller.plant.INIT_LOW
+        return x + reach * rng.uniform(-1, 1, size=x.shape) * width
     if case == "plan not finite" and controller.plan is not None:
         if isinstance(controller.plan, tuple):  # goal_mpc.py: with multipliers of bounds and of constraints
             plan = controller.plan[0].copy()
@@ -171,12 +148,13 @@ def spoil(controller, case, x, rng):
     return x
 
 
-def stop(controller, case, early, usual):
+def stop(controller, case):
     """Bring a fault of the solver about, or with case None take it back."""
-    if early is not None:
-        controller.solvers = early if case and case.startswith("stopped early") else usual
-    elif hasattr(controller, "iterations"):
-        controller.iterations = 1 if case and case.startswith("stopped early") else deploy.Args.iterations
+    early = case is not None and case.startswith("stopped early")
+    if isinstance(controller, Hasty):
+        controller.early = early
+    elif isinstance(controller, deploy.ScenarioMPC):
+        controller.iterations = 1 if early else deploy.Args.iterations
         controller.deadline_ms = 1e-3 if case == "deadline" else None
 
 
@@ -191,14 +169,17 @@ def answered(controller):
 def closed_loop(cell):
     """One case of one controller: the counts that are a row of the table."""
     case, name, steps, seed = cell
-    controller, early = built(name)
+    controller, lasting = built(name), case in LASTING
     plant, rng = controller.plant, np.random.default_rng([seed, *case.encode(), *name.encode()])
     counts = collections.Counter({key: 0 for key in COUNTS})
-    usual, lasting = getattr(controller, "solvers", None), case in LASTING
+
+    def chance():
+        counts.update(chances=1, recovered=int(answered(controller) == "planned"))
+
     for _ in range(max(steps // EPISODE, 1)):
         x, goal, psi = draw(plant, rng)
         goal = out_of_reach(controller, goal, rng) if case == "goal out of reach" else goal
-        stop(controller, case if lasting else None, early, usual)
+        stop(controller, case if lasting else None)
         controller.reset()
         controller.set_goal(goal)
         faulty_before = False
@@ -206,7 +187,7 @@ def closed_loop(cell):
             faulty = case != "random" and t % 4 == 2 and not lasting
             measured = spoil(controller, case, x, rng) if faulty else x
             if not lasting:
-                stop(controller, case if faulty else None, early, usual)
+                stop(controller, case if faulty else None)
             counts["faults"] += faulty or lasting
             try:
                 u = controller.make_step(measured)
@@ -215,30 +196,27 @@ def closed_loop(cell):
                     raise
                 counts["refused"] += 1
                 u = controller.make_step(x)  # the true state, as the next message may bring it
-                counts.update(chances=1, recovered=int(answered(controller) == "planned"))
+                chance()
             else:
                 counts["wrong"] += not np.isfinite(measured).all()
                 if faulty_before:
-                    counts.update(chances=1, recovered=int(answered(controller) == "planned"))
+                    chance()
                 faulty_before = faulty
             stats = controller.stats
             counts[answered(controller)] += 1
             counts["cost_rose"] += not stats.get("cost", 0.0) <= stats.get("guess_cost", np.inf)  # nor is nan
             counts["qp_unsolved"] += stats.get("stop") == "unsolved"
-            counts["wrong"] += not (
-                np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all()
-            )
+            allowed = np.isfinite(u).all() and (plant.U_LOW <= u).all() and (u <= plant.U_HIGH).all()
+            counts["wrong"] += not allowed
             x = plant.step(x, u, psi)
         if lasting:  # a last step without it
-            stop(controller, None, early, usual)
+            stop(controller, None)
             controller.set_goal(plant.EVAL_GOAL)
             controller.make_step(x)
-            counts.update(chances=1, recovered=int(answered(controller) == "planned"))
-    stop(controller, None, early, usual)
-    return [
-        {"case": case, "controller": name, "steps": counts["planned"] + counts["fell_back"] + counts["held"]}
-        | dict(counts)
-    ]
+            chance()
+    stop(controller, None)
+    total = sum(counts[key] for key in ("planned", "fell_back", "held"))
+    return [{"case": case, "controller": name, "steps": total} | dict(counts)]
 
 
 def controllers(args):
@@ -247,60 +225,30 @@ def controllers(args):
         for case in (case for case in FAULTS if name in FAULTS[case]):
             steps = 10 if args.quick else STEPS.get((case, name), 1_000)
             rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
-    inputs = [
-        Path(__file__),
-        *sorted((ROOT / "envs").rglob("*.py")),
-        Path(gm.__file__),
-        Path(deploy.__file__),
-    ]
     total = {}
-    for row in cells.collect(closed_loop, rounds, args.jobs, args.runs, inputs):
+    for row in common.collect(closed_loop, rounds, args.runs, args.jobs):
         counts = total.setdefault((row["case"], row["controller"]), collections.Counter())
-        counts.update({key: int(value) for key, value in row.items() if key not in ("case", "controller")})
-    return [
-        {"case": case, "controller": name} | dict(total[case, name])
-        for case in FAULTS
-        for name in FAULTS[case]
-    ]
+        counts.update({key: int(value) for key, value in without(row, "case", "controller").items()})
+    rows = [(case, name) for case in FAULTS for name in FAULTS[case]]
+    return [{"case": case, "controller": name} | dict(total[case, name]) for case, name in rows]
 
 
 # Training
 
 
-TRAINING = [
-    "--env",
-    "cstr",
-    "--hidden",
-    "16",
-    "16",
-    "--total-timesteps",
-    "19200",
-    "--learning-starts",
-    "320",
-    "--eval-every",
-    "1600",
-    "--eval-episodes",
-    "20",
-    "--save-every",
-    "160",
-    "--buffer-size",
-    "3200",
-]
+TRAINING = "--env cstr --hidden 16 16 --total-timesteps 19200 --learning-starts 320 --eval-every 1600".split()
+TRAINING += "--eval-episodes 20 --save-every 160 --buffer-size 3200".split()
 
 
 def train(*arguments, kill_after=None):
     """The training script in a process of its own, killed after some seconds unless it has finished. Returns whether it finished."""
-    process = subprocess.Popen(
-        [sys.executable, "sac_her_branching.py", *map(str, arguments)],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "sac_her_branching.py", *map(str, arguments)]
+    options = dict(cwd=ROOT, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(command, **options)
     try:
         _, error = process.communicate(timeout=kill_after)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         process.communicate()
         return False
     if process.returncode:
@@ -311,9 +259,8 @@ def train(*arguments, kill_after=None):
 def equal(a, b):
     """Whether nested plain data and tensors are the same, bit for bit, but for times and folders."""
     if isinstance(a, dict):
-        return a.keys() == b.keys() and all(
-            equal(a[k], b[k]) for k in a if k not in ("seconds", "train_seconds", "out")
-        )
+        kept = [key for key in a if key not in ("seconds", "train_seconds", "out")]
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in kept)
     if isinstance(a, (list, tuple)):
         return len(a) == len(b) and all(map(equal, a, b))
     return torch.equal(a, b) if torch.is_tensor(a) else a == b or (a != a and b != b)
@@ -322,15 +269,13 @@ def equal(a, b):
 def killed(cell):
     """Trainings killed at random moments, until so many kills have come about; each end is compared with that of one that was not."""
     branches, kills, seed = cell
-    rng, counts = (
-        np.random.default_rng(seed),
-        collections.Counter({key: 0 for key in ("kills", "half", "mid_write", "ends", "same")}),
-    )
+    rng = np.random.default_rng(seed)
+    counts = collections.Counter(kills=0, half=0, mid_write=0, ends=0, same=0)
     with tempfile.TemporaryDirectory() as folder:
-        folder = Path(folder)
-        start, runs = [*TRAINING, "--branches", branches, "--seed", seed, "--out"], folder / "killed"
+        untouched, runs = Path(folder) / "whole", Path(folder) / "killed"
+        start = [*TRAINING, "--branches", branches, "--seed", seed, "--out"]
         tick = time.perf_counter()
-        train(*start, folder / "whole")
+        train(*start, untouched)
         seconds = time.perf_counter() - tick
         while counts["kills"] < kills:
             shutil.rmtree(runs, ignore_errors=True)
@@ -338,23 +283,16 @@ def killed(cell):
             while not finished:
                 saved = list(runs.glob("*/resume.pt"))
                 arguments = ["--resume", saved[0]] if saved else [*start, runs]
-                finished = train(
-                    *arguments,
-                    kill_after=rng.uniform(0.3, 0.9) * seconds if counts["kills"] < kills else None,
-                )
+                moment = rng.uniform(0.3, 0.9) * seconds if counts["kills"] < kills else None
+                finished = train(*arguments, kill_after=moment)
                 if not finished:
-                    counts.update(
-                        kills=1,
-                        mid_write=int(any(runs.glob("*/*.tmp"))),
-                        half=int(not all(map(whole, runs.glob("*/*.pt")))),
-                    )
-            ends = [next(place.glob("*/resume.pt")).parent for place in (folder / "whole", runs)]
-            same = all(
-                equal(*(torch.load(end / name, weights_only=True) for end in ends))
-                for name in ("resume.pt", "checkpoint.pt")
-            )
-            tables = [without_times(end / "evaluations.csv") for end in ends]
-            counts.update(ends=1, same=int(same and tables[0] == tables[1]))
+                    broken = not all(map(whole, runs.glob("*/*.pt")))
+                    counts.update(kills=1, mid_write=int(any(runs.glob("*/*.tmp"))), half=int(broken))
+            ends = [next(place.glob("*/resume.pt")).parent for place in (untouched, runs)]
+            same = equal(*(without_times(end / "evaluations.csv") for end in ends))
+            for name in ("resume.pt", "checkpoint.pt"):
+                same = same and equal(*(torch.load(end / name, weights_only=True) for end in ends))
+            counts.update(ends=1, same=int(same))
     return [{"branches": branches} | dict(counts)]
 
 
@@ -369,19 +307,12 @@ def whole(path):
 
 def training(args):
     parts = [(branches, 1 if args.quick else 30, seed) for seed, branches in enumerate((1, 4))]
-    inputs = [Path(__file__), *sorted((ROOT / "envs").rglob("*.py")), Path(sac.__file__)]
-    found = cells.collect(killed, parts, args.jobs, args.runs, inputs)
-    kills, half, mid_write, ends, same = (
-        sum(int(row[key]) for row in found) for key in ("kills", "half", "mid_write", "ends", "same")
-    )
+    found = common.collect(killed, parts, args.runs, args.jobs)
+    keys = ("kills", "half", "mid_write", "ends", "same")
+    kills, half, mid_write, ends, same = (sum(int(row[key]) for row in found) for key in keys)
+    detail = f"{mid_write} of them while a file was written"
     return [
-        result(
-            "training",
-            "SIGKILL: what was saved is whole",
-            kills,
-            kills - half,
-            f"{mid_write} of them while a file was written",
-        ),
+        result("training", "SIGKILL: what was saved is whole", kills, kills - half, detail),
         result("training", "killed and resumed: equal to an uninterrupted run", ends, same),
     ]
 
@@ -392,7 +323,7 @@ def result(study, case, trials, held, detail=""):
 
 def without_times(path):
     """A table without the columns that may differ from run to run."""
-    return [{key: value for key, value in row.items() if not TIMES.search(key)} for row in cells.read(path)]
+    return [{key: value for key, value in row.items() if not TIMES.search(key)} for row in common.read(path)]
 
 
 # Checkpoints
@@ -437,20 +368,15 @@ def hostile(data, rng, tries):
             value = value if not isinstance(value, list) else [float(v) for v in value]
             yield "entries missing or of another type", stored(data | {key: value})
     for key, value in data["scaling"].items():
-        for changed in (
-            value[:-1],
-            [float("nan")] * len(value),
-            [0.0] * len(value),
-            None,
-            [10**6] * len(value),
-        ):
+        n = len(value)
+        for changed in (value[:-1], [float("nan")] * n, [0.0] * n, None, [10**6] * n):
             yield "scaling damaged", stored(data | {"scaling": data["scaling"] | {key: changed}})
 
 
 LOADERS = (sac.load_policy, lambda path: deploy.load_critic(path, "cstr"))
 
 
-def read(load, path):
+def verdict(load, path):
     """What a loader makes of a file, counted: refused in one sentence, loaded to finite values, or neither ("wrong")."""
     try:
         agent = load(path)
@@ -459,12 +385,11 @@ def read(load, path):
     except Exception as error:
         print(f"{path}: {type(error).__name__} {error}", file=sys.stderr)
         return collections.Counter(["wrong"])
+    start, goal = agent.plant.START, agent.plant.EVAL_GOAL
     if isinstance(agent, sac.Policy):
-        value = agent.value(agent.plant.START, agent.plant.EVAL_GOAL)
+        value = agent.value(start, goal)
     else:
-        value = torch_value(
-            agent, *(torch.from_numpy(v)[None] for v in (agent.plant.START, agent.plant.EVAL_GOAL))
-        ).numpy()
+        value = torch_value(agent, torch.from_numpy(start)[None], torch.from_numpy(goal)[None]).numpy()
     return collections.Counter(["loaded" if np.isfinite(value).all() else "wrong"])
 
 
@@ -477,21 +402,16 @@ def checkpoints(args):
         for case, content in hostile(data, rng, 10 if args.quick else 300):
             path.write_bytes(content)
             for load in LOADERS:
-                counts[case] += read(load, path)
+                counts[case] += verdict(load, path)
         with open(path, "wb") as file:  # takes no space on the disk
             file.truncate(2 * MAX_CHECKPOINT_BYTES)
         for load in LOADERS:
-            counts["larger than a gigabyte"] += read(load, path)
-    return [
-        result(
-            "checkpoints",
-            case,
-            sum(found.values()),
-            found["refused"] + found["loaded"],
-            f"{found['loaded']} of them loaded",
-        )
-        for case, found in counts.items()
-    ]
+            counts["larger than a gigabyte"] += verdict(load, path)
+    rows = []
+    for case, found in counts.items():
+        held, detail = found["refused"] + found["loaded"], f"{found['loaded']} of them loaded"
+        rows.append(result("checkpoints", case, sum(found.values()), held, detail))
+    return rows
 
 
 # Many deployments
@@ -507,9 +427,8 @@ def deployments(args):
         for _ in range(steps):
             x = controller.plant.step(x, controller.make_step(x), psi)
         if i + 1 in (most // 10, most):
-            sizes.append(
-                resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e3 if sys.platform == "linux" else 1e6)
-            )
+            largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kilobytes; of macOS bytes
+            sizes.append(largest / (1e3 if sys.platform == "linux" else 1e6))
     grown = sizes[1] - sizes[0]
     detail = f"{sizes[0]:.0f} MB at the most up to {most // 10}, {sizes[1]:.0f} MB up to {most}"
     return [result("deployments", "memory grows by less than 10 MB", most, most * (grown < 10), detail)]
@@ -526,56 +445,36 @@ def determinism(args):
     for processes in (1, 2):
         folder = args.runs / f"determinism_{processes}"
         shutil.rmtree(folder, ignore_errors=True)
-        command = [
-            "--quick",
-            "--jobs",
-            3 - processes,
-            "--step-jobs",
-            processes,
-            "--out",
-            folder,
-            "--runs",
-            folder / "runs",
-            "--only",
-            *steps,
-        ]
-        command = [sys.executable, "experiments/reproduce.py", *map(str, command)]
+        command = ["experiments/reproduce.py", "--quick", "--jobs", 3 - processes, "--step-jobs", processes]
+        command += ["--out", folder, "--runs", folder / "runs", "--only", *steps]
+        command = [sys.executable, *map(str, command)]
         out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         if out.returncode:
             raise RuntimeError(out.stderr)
-        found[processes] = {
-            path.name: without_times(path) for path in sorted((folder / "results").glob("*.csv"))
-        }
-        found[processes] |= {
-            path.name: torch.load(path, weights_only=True)
-            for path in sorted((folder / "pretrained").glob("*.pt"))
-        }
+        tables, critics = (folder / "results").glob("*.csv"), (folder / "pretrained").glob("*.pt")
+        found[processes] = {path.name: without_times(path) for path in tables}
+        found[processes] |= {path.name: torch.load(path, weights_only=True) for path in critics}
     rows = []
     for kind, case in ((".csv", "tables: the same but for times"), (".pt", "critics: the same weights")):
-        names = sorted(name for name in set(found[1]) | set(found[2]) if name.endswith(kind))
+        names = sorted(name for name in found[1] | found[2] if name.endswith(kind))
         different = [name for name in names if not equal(found[1].get(name), found[2].get(name))]
-        rows.append(
-            result("determinism", case, len(names), len(names) - len(different), ", ".join(different))
-        )
+        held, detail = len(names) - len(different), ", ".join(different)
+        rows.append(result("determinism", case, len(names), held, detail))
     return rows
 
 
+STUDIES = {"controllers": controllers, "training": training, "checkpoints": checkpoints}
+STUDIES |= {"deployments": deployments, "determinism": determinism}
+
+
 def main(args):
-    table = f"reliability_{args.study}.csv"
-    cells.check(args, table, jobs=(1, 1024))
-    args.runs.mkdir(parents=True, exist_ok=True)
+    table = f"reliability_{args.study}"
+    common.check(args, table)
     if not args.plot_only:
-        study = {
-            "controllers": controllers,
-            "training": training,
-            "checkpoints": checkpoints,
-            "deployments": deployments,
-            "determinism": determinism,
-        }[args.study]
-        cells.write(study(args), args.out / "results" / table)
-    for row in cells.read(args.out / "results" / table):
+        common.write(STUDIES[args.study](args), args.table(table))
+    for row in common.read(args.table(table)):
         print("  ".join(f"{key} {value}" for key, value in row.items()))
 
 
 if __name__ == "__main__":
-    cells.run(main, tyro.cli(Args, description=__doc__))
+    common.command_line(main, Args, __doc__)

@@ -3,13 +3,9 @@
 rl_mpc_deploy.py's controllers solve the same problems by an iteration of their own; experiments set these beside them.
 """
 
-import sys
-from pathlib import Path
-
 import casadi as ca
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 
@@ -48,11 +44,11 @@ class IpoptMPC(gm.ScenarioMPC):
 
     def tree_guess(self, x0, action):
         """w of the plan whose actions are `action(t, x)`, (n_x, nodes) -> (n_u, nodes): predicted states, slack as needed."""
-        tree, x, states, actions = self.tree, (x0 - self.x_center)[:, None] / self.x_scale[:, None], [], []
+        tree, states, actions = self.tree, [], []
+        center, scale = self.x_center[:, None], self.x_scale[:, None]
+        x = (x0[:, None] - center) / scale
         for t in range(self.horizon):
-            u = np.array(action(t, x * self.x_scale[:, None] + self.x_center[:, None])).reshape(
-                len(self.u_scale), -1
-            )
+            u = np.array(action(t, x * scale + center)).reshape(len(self.u_scale), -1)
             actions.append(np.clip(u, self.plant.U_LOW[:, None], self.plant.U_HIGH[:, None]))
             here = slice(tree.first[t + 1], tree.first[t + 2])
             parent, psi = tree.parent[here] - tree.first[t], self.scenarios[tree.scenario[here]].T
@@ -89,7 +85,8 @@ class IpoptMPC(gm.ScenarioMPC):
         if self.found is not None and np.abs((x0 - self.x_compared) / self.x_scale).max() < AT_REST:
             self.plan = self.found
             return
-        self.x_compared, plans = x0, [self.plan]
+        self.x_compared = x0
+        plans = [self.plan]
         if self.policy is not None and self.found is not None:
             # where things move, an action that is planned for later would be put off for ever
             if np.abs((x0 - self.x_before) / self.x_scale).max() < deploy.HARDLY_MOVED:
@@ -133,10 +130,9 @@ class RelaxedMPC(IpoptMPC):
             self.relaxed.reset(u)
 
     def solve(self, *arguments):
-        relaxed = (
-            self.relaxed is not None and self.stats["rung"] == "retry"
-        )  # a second try is the other problem's
-        return None if relaxed else super().solve(*arguments)
+        if self.relaxed is not None and self.stats["rung"] == "retry":
+            return None  # a second try is the other problem's
+        return super().solve(*arguments)
 
     def action(self, x, tick):
         other, spent = self.relaxed, 0
@@ -164,13 +160,10 @@ class PrintedMPC(IpoptMPC):
     """eq:QMPC as printed: stage cost and soft constraints at x_0 ... x_{N-1}, so that nothing bounds the last state but its value."""
 
     def __init__(self, plant, horizon, scenarios, stage_cost, terminal_cost=None, **options):
-        x, u, goal = (
-            ca.MX.sym(name, n)
-            for name, n in (("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX)))
-        )
-        stage = ca.Function(
-            "stage", [x, u, goal], [stage_cost(x, goal)], {"never_inline": True}
-        )  # of a state and its action: before x_N
+        sizes = ("x", len(plant.X_LOW)), ("u", len(plant.U_LOW)), ("goal", len(plant.GOAL_INDEX))
+        x, u, goal = (ca.MX.sym(*size) for size in sizes)
+        # of a state and its action: before x_N
+        stage = ca.Function("stage", [x, u, goal], [stage_cost(x, goal)], {"never_inline": True})
         super().__init__(plant, horizon, scenarios, stage, terminal_cost, **options)
 
     def build_problem(self, *costs):
@@ -186,25 +179,12 @@ class LiteralMPC(PrintedMPC):
     since that state has no soft constraint the other scenarios are not there.
     """
 
-    def __init__(
-        self,
-        plant,
-        horizon,
-        scenarios,
-        *costs,
-        robust_horizon=1,
-        slack_price=1.0,
-        change_weight=0.0,
-        **options,
-    ):
+    def __init__(self, plant, horizon, scenarios, *costs, robust_horizon=1, slack_price=1.0, **options):
         S = len(scenarios) if robust_horizon else 1
-        options |= dict(
-            slack_price=S * np.array(slack_price),
-            change_weight=S * np.broadcast_to(change_weight, len(plant.U_LOW)),
-        )
-        super().__init__(
-            plant, horizon, scenarios, *costs, robust_horizon=robust_horizon if horizon > 1 else 0, **options
-        )
+        changes = np.broadcast_to(options.pop("change_weight", 0.0), len(plant.U_LOW))
+        options |= dict(slack_price=S * np.array(slack_price), change_weight=S * changes)
+        options |= dict(robust_horizon=robust_horizon if horizon > 1 else 0)
+        super().__init__(plant, horizon, scenarios, *costs, **options)
 
 
 def squared_error(plant):
@@ -216,9 +196,8 @@ def squared_error(plant):
 def gaussian(plant, sigma2=None):
     """Stage cost of RL+MPC; sigma2: the plant's by default."""
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(plant.GOAL_INDEX))
-    return ca.Function(
-        "stage", [x, g], [-ca.exp(-squared_error(plant)(x, g) / (2 * (sigma2 or plant.MPC_SIGMA2)))]
-    )
+    shaped = -ca.exp(-squared_error(plant)(x, g) / (2 * (sigma2 or plant.MPC_SIGMA2)))
+    return ca.Function("stage", [x, g], [shaped])
 
 
 def negative(V):
@@ -227,28 +206,33 @@ def negative(V):
     return ca.Function("terminal", [x, g], [-V(x, g)])
 
 
-def build_controller(name, args, kind=IpoptMPC):
-    """A planner of rl_mpc_deploy.py by IPOPT, from the same arguments; kind: the class of RL+MPC. Raises ValueError for another name.
+def benchmark(plant, name, scenarios, replaced=()):
+    """Horizon, and keywords of a planner, of nominal_mpc or robust_mpc; replaced: items in place of those of the plant's BENCHMARK.
 
-    nominal_mpc, robust_mpc: the published benchmark, which sums slack and the price of changes over scenarios.
+    The published benchmark sums slack and the price of changes over scenarios, where the planners take means.
+    """
+    found, robust = plant.BENCHMARK | dict(replaced), name == "robust_mpc"
+    counted = len(scenarios) if robust else 1
+    prices = {key: counted * np.array(found[key]) for key in ("slack_price", "change_weight")}
+    return found["horizon"], prices | dict(robust_horizon=int(robust))
+
+
+def build_controller(name, args, kind=IpoptMPC, replaced=()):
+    """A planner of rl_mpc_deploy.py by IPOPT, from the same arguments. Raises ValueError for another name.
+
+    kind: the class of RL+MPC; replaced: see `benchmark`.
     """
     plant, goal, critic = deploy.check(args)
     scenarios, options = plant.SCENARIOS["mpc"], dict(goal=goal, compile=args.compile)
     if name in ("nominal_mpc", "robust_mpc"):
-        S, benchmark = len(scenarios) if name == "robust_mpc" else 1, plant.BENCHMARK
-        options |= dict(
-            robust_horizon=int(S > 1),
-            slack_price=S * benchmark["slack_price"],
-            change_weight=S * benchmark["change_weight"],
-        )
-        return RelaxedMPC(plant, benchmark["horizon"], scenarios, squared_error(plant), **options)
+        horizon, problem = benchmark(plant, name, scenarios, replaced)
+        return RelaxedMPC(plant, horizon, scenarios, squared_error(plant), **problem, **options)
     if name != "rl_mpc":
         raise ValueError(f"{name!r} is not a controller by IPOPT; choose nominal_mpc, robust_mpc or rl_mpc")
     mu, _, V = deploy.export(critic)
-    slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
-    options |= dict(
-        robust_horizon=args.robust_horizon, slack_price=slack_weight if args.constraints == "soft" else np.inf
-    )
+    price = critic.slack_weight if args.slack_weight is None else args.slack_weight
+    price = price if args.constraints == "soft" else np.inf
+    options |= dict(robust_horizon=args.robust_horizon, slack_price=price)
     # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
     options |= dict(policy=mu, barrier="adaptive")
     return kind(plant, args.horizon, scenarios, gaussian(plant), negative(V), **options)
