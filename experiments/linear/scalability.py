@@ -227,10 +227,12 @@ def collect(args):
 
 
 def draw_bands(ax, dimensions, values, colour, style, label):
-    """Median and band of 2.5 to 95 percentile; values: an array for each dimension."""
+    """Median and bar of 2.5 to 95 percentile, the controllers' beside each other; values: an array for each dimension."""
     low, median, high = np.transpose([np.quantile(v, [0.025, 0.5, 0.95]) for v in values])
-    ax.plot(dimensions, median, style, color=colour, lw=2, label=label)
-    ax.fill_between(dimensions, low, high, color=colour, alpha=0.2, lw=0)
+    at = np.array(dimensions) * 1.04 ** (1 if colour == CONTROLLERS["goal"][1] else -1)
+    ax.errorbar(
+        at, median, (median - low, high - median), fmt=style, color=colour, lw=1.5, capsize=4, label=label
+    )
 
 
 def by_dimension(ax, dimensions):
@@ -253,7 +255,7 @@ def plot_main(rows, path):
     axes[-1].set_xlabel("number of states n")
     axes[0].legend(frameon=False)
     systems, starts = (len(distinct(rows, key)) for key in ("system", "start"))
-    title = f"{systems} systems per point, {starts} starts each; band: 2.5 to 95 percentile"
+    title = f"{systems} systems per point, {starts} starts each: median, 2.5 to 95 percentile"
     axes[0].set_title(title, fontsize=10)
     common.save(fig, path)
 

@@ -29,14 +29,24 @@ CURVES = {  # label: (colour, marker, keywords of rl_mpc_deploy.Args)
 }
 POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
     "nominal MPC, N = 20": (GREY, "P", "nominal MPC"),
-    "robust MPC, N = 20": (GREY, "X", "robust MPC"),
-    "robust MPC, tuned": (GREY, "*", "robust MPC, tuned"),
+    "robust MPC, N = 20": (BLUE, "X", "robust MPC, N = 20"),
+    "robust MPC, tuned": (BLUE, "*", "robust MPC, tuned, N = 40"),
     "goal-conditioned MPC, N = 5": (ORANGE, "P", "goal-conditioned MPC, N = 5"),
     "RL, constraint-aware": (RED, "^", "RL, constraint-aware"),
     "RL+MPC, constraint-aware, N = 0": (GREEN, "P", "RL+MPC, N = 0"),
     "RL+MPC, constraint-aware, N = 5, hard": (GREEN, "*", "RL+MPC, N = 5, hard"),
     "RL, paper's": (RED, "v", "RL, paper's"),
     "RL+MPC, paper's, N = 0": (PINK, "P", "RL+MPC, N = 0, paper's critic"),
+}
+# what the figure shows, with where its name stands in the panel of medians and of 5th percentiles
+DRAWN = {
+    "oracle": ((-5, 93.2), (-7.2, 86.5)),
+    "RL+MPC, N = 5": ((0.25, 83.2), (-7.2, 71)),
+    "RL+MPC, N = 5, paper's critic": ((-70, 79), (-100, 60)),
+    "robust MPC, N = 20": ((0.25, 73.6), (-9, 1.5)),
+    "robust MPC, tuned, N = 40": ((0.25, 78), (-9, 46)),
+    "RL, constraint-aware": ((0.25, 80.6), (-7.2, 54)),
+    "RL, paper's": ((-80, 89.5), (-100, 71)),
 }
 
 
@@ -55,8 +65,10 @@ def plot(args):
             title=title, xlabel="time outside constraints [steps], 0 is best", ylabel="time near goal [steps]"
         )
         ax.set_xscale("symlog", linthresh=1)
-        ax.set_xlim(-120, 0.3 if title == "medians" else -5)
-        ax.set_xticks([-100, -30, -10, -3, -1, 0], ["-100", "-30", "-10", "-3", "-1", "0"])
+        ax.set_xlim(-120, 30 if title == "medians" else -2.5)
+        ax.set_ylim((65, 95) if title == "medians" else (-3, 90))
+        ticks = [-100, -30, -10, -3, -1, 0]
+        ax.set_xticks(ticks, ticks)
         ax.grid(alpha=0.3)
     print(f"{len(draws)} draws{'':36s}near goal: median  5 %-ile   outside: median  5 %-ile")
 
@@ -64,12 +76,16 @@ def plot(args):
         """Draw a curve, a group of rows per slack weight, or a single point without one."""
         points = [summary(group) for group in groups]
         size = 9 if len(points) == 1 else 6
-        for k, ax in enumerate(axes):
+        for k, ax in enumerate(axes) if label in DRAWN else ():
             x, y = [p[1][k] for p in points], [p[0][k] for p in points]
-            ax.plot(x, y, marker=marker, color=colour, ls=ls, ms=size, lw=1.5, label=label)
+            ax.plot(x, y, marker=marker, color=colour, ls=ls, ms=size, lw=1.5)
+            name = label.replace(", paper's", ",\npaper's")
+            ax.text(*DRAWN[label][k], name, color=colour, fontsize=9, va="center")
             for weight, *at in zip(weights, x, y):
                 if weight in (weights[0], "2", weights[-1]):
-                    style = dict(xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour)
+                    style = dict(
+                        xytext=(-5, 3), textcoords="offset points", fontsize=7, color=colour, ha="right"
+                    )
                     ax.annotate(weight, at, **style)
         for weight, ((near, near_low), (outside, outside_low)) in zip(weights, points):
             text = f"{label}, slack weight {weight}" if weight else label
@@ -89,7 +105,6 @@ def plot(args):
     controllers = of_these_draws("cstr_deploy")
     for variant, (colour, marker, label) in POINTS.items():
         draw([select(controllers, variant=variant)], label, colour, marker, ls="none")
-    common.legend(fig, axes[0], ncols=4)
     common.save(fig, args.figure("cstr_frontier"))
 
 

@@ -59,6 +59,9 @@ CONTROLLERS = {  # label: (colour, dashes, keywords of rl_mpc_deploy.Args and of
     "RL+MPC, offset-free": (GREEN, "-", RL_MPC | AWARE | FREE),
     "RL+MPC, parameters": (PINK, "--", RL_MPC | AWARE | PARAMETERS),
 }
+# those whose answer to a change is drawn, with where their names stand
+ADAPTING = {"RL+MPC": (12, -5.4), "RL+MPC, offset-free": (12, 0.3), "robust MPC, tuned": (12, -3.6)}
+ADAPTING |= {"RL, offset-free": (12, 1.1)}
 WHOLE, FIFTH, HALF = dict(spread=1.0), dict(spread=0.2), dict(spread=0.5)
 SETTINGS = {  # of RL+MPC, on a fixed plant alone
     "disturbance, whole spread": RL_MPC | AWARE | FREE | WHOLE,
@@ -195,27 +198,38 @@ def plot_loops(rows, paths, path):
         xscale="log", xlabel="offset of $c_B$ over the last 25 steps [%]", title="a fixed, unknown plant"
     )
     for label, mine in grouped(paths, "controller").items():
+        if label not in ADAPTING:
+            continue
         colour, dashes, _ = CONTROLLERS[label]
         c_b = np.array([[float(v) for v in row["c_B"].split()] for row in mine])
         error, steps = 100 * (c_b / cstr.EVAL_GOAL[0] - 1), np.arange(c_b.shape[1]) - c_b.shape[1] // 2
         shown = steps >= -10
-        axes[1].plot(steps[shown], np.median(error, 0)[shown], color=colour, ls=dashes, lw=2, label=label)
+        axes[1].plot(steps[shown], np.median(error, 0)[shown], color=colour, ls=dashes, lw=2)
+        axes[1].text(*ADAPTING[label], label, color=colour, fontsize=9)
     axes[1].axhline(0, color="black", lw=1, alpha=0.5)
     axes[1].set(xlabel=r"steps after $\beta$ falls from 1.0 to 0.9", title="the catalyst loses activity")
-    axes[1].set(ylabel="$c_B$ above the goal [%], median of 20 draws", ylim=(-12, 6))
-    axes[1].legend(frameon=False, fontsize=7, loc="lower right")
-    for label in NOISY:
+    axes[1].set(ylabel="$c_B$ above the goal [%], median of 20 draws", ylim=(-6, 2))
+    for label in ("RL+MPC", "RL+MPC, offset-free"):
         colour = "black" if label == "RL+MPC" else CONTROLLERS[label][0]
         for gain, dashes, marker in zip(GAINS, ("-", "--", ":"), "osd"):
             by_noise = grouped(select(rows, case="noise", controller=label, gain=gain), "noise").items()
             levels = [(100 * float(noise), np.median(column(mine, "offset"))) for noise, mine in by_noise]
             if levels:
-                text = label if label == "RL+MPC" else f"{label}, gain {gain:g}"
-                axes[2].plot(*zip(*levels), color=colour, ls=dashes, marker=marker, ms=4, label=text)
+                text = "" if label == "RL+MPC" else f"filter gain {gain:g}"
+                axes[2].plot(*zip(*levels), color=colour, ls=dashes, marker=marker, ms=4)
+                last, end = levels[-1]
+                axes[2].text(
+                    last + 0.04,
+                    end * (1.1 if gain == 0.3 else 1),
+                    text,
+                    color=colour,
+                    fontsize=9,
+                    va="center",
+                )
+                if not text:
+                    axes[2].text(0, levels[0][1] * 1.15, "RL+MPC without an estimate", fontsize=9)
     axes[2].set(xlabel="measurement noise [% of range]", ylabel="offset of the true $c_B$ [%], median")
-    axes[2].set(yscale="log", title="noise and the filter gain")
-    if axes[2].lines:
-        axes[2].legend(frameon=False, fontsize=7)
+    axes[2].set(yscale="log", title="RL+MPC, offset-free: noise", xlim=(-0.05, 1.5), xticks=(0, 0.2, 1))
     for ax in axes:
         ax.grid(alpha=0.3)
     common.save(fig, path)
