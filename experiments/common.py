@@ -116,13 +116,9 @@ def machine():
 # Parts that are kept
 
 
-def file_of(part):
-    """The file of a function, class or module; a path is one itself."""
-    return part if isinstance(part, Path) else Path(inspect.getfile(part)).resolve()
-
-
 def digest(places, *words):
-    """Short hash of the code in files and folders, and of words."""
+    """Short hash of code and words; places: files, folders, and functions, classes or modules, whose files are meant."""
+    places = [part if isinstance(part, Path) else Path(inspect.getfile(part)).resolve() for part in places]
     code = [text for path, text in CODE.items() if any(path.is_relative_to(place) for place in places)]
     return hashlib.sha256(b"".join([*code, repr(words).encode()])).hexdigest()[:12]
 
@@ -152,9 +148,8 @@ def collect(function, cells, runs, jobs=1, uses=()):
     Results depend on the cell, which its repr tells from others, on the three scripts and envs/, on the function's file, and on modules
     and files that it `uses`.
     """
-    places = [*SCRIPTS, ENVS, *map(file_of, (function, *uses))]
-    names = (digest(places, function.__qualname__, repr(cell)) for cell in cells)
-    paths = [runs / f"parts/{name}.csv" for name in names]
+    code = digest([*SCRIPTS, ENVS, function, *uses], function.__qualname__)
+    paths = [runs / f"parts/{digest([], code, repr(cell))}.csv" for cell in cells]
     missing = [(function, cell, path) for cell, path in zip(cells, paths) if not path.exists()]
     each(_fill, missing, jobs, "cell", len(cells) - len(missing))
     return [row for path in paths for row in read(path)]
@@ -170,7 +165,7 @@ def agent_folder(settings, runs, kind=None):
     values = vars(sac.Args(**settings)) | {"out": None, "save_every": None}
     values = {name: value.name if isinstance(value, Path) else value for name, value in values.items()}
     kind = kind or sac.SAC
-    code = digest([TRAINING, ENVS, file_of(kind)], kind.__qualname__, values)
+    code = digest([TRAINING, ENVS, kind], kind.__qualname__, values)
     return runs / f"agents/{values['env']}_{values['seed']}_{code}"
 
 

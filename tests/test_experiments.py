@@ -8,12 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import torch
 import tyro
 
-from experiments import reproduce
+import rl_mpc_deploy as deploy
+from envs import cstr
+from experiments import common, reproduce
+from experiments.reactor import loops, offline, oracle, tune
 
 ROOT = Path(__file__).parent.parent
 TABLES = sorted(path.name for path in (ROOT / "experiments/results").glob("*.csv"))
@@ -121,8 +124,67 @@ def test_figures_are_drawn_from_the_committed_tables(step, tmp_path):
     shutil.copytree(ROOT / "experiments/results", tmp_path / "results")
     module = importlib.import_module(step.command[0].removesuffix(".py").replace("/", "."))
     module.main(tyro.cli(module.Args, args=[*step.command[1:], "--plot-only", "--out", str(tmp_path)]))
-    plt.close("all")
     assert all(path.stat().st_size > 10_000 for path in (tmp_path / "figures").iterdir())
+
+
+def test_importing_experiments_leaves_the_backend_of_matplotlib_alone():
+    names = [
+        path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+        for path in (ROOT / "experiments").glob("*/*.py")
+        if path.stem != "peer_do_mpc"  # which lives in an environment of its own
+    ]
+    code = f"import matplotlib; matplotlib.use('svg'); import {', '.join(names)}; print(matplotlib.get_backend())"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert out.stdout.strip() == "svg", out.stderr
+
+
+def square(number):
+    return [{"number": number, "square": number**2}]
+
+
+def test_finished_cells_are_kept_until_the_code_changes(tmp_path, monkeypatch):
+    def collect():
+        rows = common.collect(square, [1, 2], tmp_path)
+        assert rows == [{"number": "1", "square": "1"}, {"number": "2", "square": "4"}]
+        return len(list((tmp_path / "parts").iterdir()))
+
+    assert collect() == collect() == 2
+    monkeypatch.setitem(common.CODE, ROOT / "experiments/reactor/loops.py", b"changed")
+    assert collect() == 2
+    monkeypatch.setitem(common.CODE, ROOT / "envs/cstr.py", b"changed")
+    assert collect() == 4
+
+
+def test_agents_are_told_apart_by_their_arguments_and_the_code(tmp_path, monkeypatch):
+    def folder(kind=None, **settings):
+        return common.agent_folder(settings, tmp_path, kind)
+
+    assert folder() == folder(scenarios="robust", hidden=(64, 64)) == folder(add_plant_data=None)
+    data = folder(add_plant_data=tmp_path / "a.npz")
+    assert data == folder(add_plant_data=Path("a.npz"))  # whose name is of its contents
+    before = {folder(), data, folder(seed=1), folder(gamma=0.95), folder(offline.ScenarioCritics)}
+    monkeypatch.setitem(common.CODE, ROOT / "sac_her_branching.py", b"changed")
+    assert len(before | {folder()}) == 6
+
+
+def test_controllers_of_the_loops_are_those_of_the_deployment_script():
+    """But for what they change: a benchmark of its own, or another class."""
+    published = tuple(cstr.BENCHMARK.items())
+    for name, options in (("nominal_mpc", {}), ("robust_mpc", {}), ("nominal_mpc", {"offset_free": True})):
+        settings = deploy.Args(compile=False, iterations=1, **options)
+        pair = deploy.build_controller(name, settings), loops.benchmark_mpc(name, settings, published)
+        for x in (cstr.START, cstr.START + 0.01):
+            assert (
+                np.array_equal(*(mpc.make_step(x) for mpc in pair))
+                and pair[0].stats["cost"] == pair[1].stats["cost"]
+            )
+    settings = deploy.Args(compile=False, horizon=2)
+    pair = deploy.build_controller("rl_mpc", settings), loops.value_mpc(settings)
+    for x in (cstr.START, cstr.START + 0.01):
+        assert (
+            np.array_equal(*(mpc.make_step(x) for mpc in pair))
+            and pair[0].stats["cost"] == pair[1].stats["cost"]
+        )
 
 
 def test_the_peers_of_the_benchmark(quick):
@@ -201,8 +263,6 @@ def test_the_oracle_is_no_worse_than_any_controller():
 
 
 def test_the_tuned_benchmark_is_the_best_of_its_table():
-    from experiments.reactor import tune
-
     rows = list(csv.DictReader(open(ROOT / "experiments/results/cstr_tune.csv")))
     for solver, tuned in (("anytime", tune.TUNED), ("IPOPT", tune.TUNED_IPOPT)):
         mine = [row for row in rows if row.get("solver", "IPOPT") == solver]
@@ -210,9 +270,6 @@ def test_the_tuned_benchmark_is_the_best_of_its_table():
 
 
 def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
-    from envs import cstr
-    from experiments.reactor import oracle
-
     problem, x0, psi = (
         oracle.Oracle(20, compile=False),
         np.array([0.8, 0.4, 120.0, 118.0]),
@@ -230,10 +287,6 @@ def test_the_oracles_plan_is_feasible_and_better_than_its_guess():
 
 def test_a_critic_per_scenario_equals_twin_critics_one_by_one():
     """offline.py's critics, all evaluated at once, against TwinCritic for each pair."""
-    import torch
-
-    from experiments.reactor import offline
-
     network = dict(n_in=5, n_u=2, hidden=[8, 8])
     many, z, a = offline.ManyCritics(3, **network), torch.randn(3, 4, 5), torch.randn(3, 4, 2)
     together, alone = many.each(z, a), many.each(z[0], a[0])
