@@ -27,11 +27,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from experiments import common
 from experiments.common import ENVS, HERE, ROOT, SCRIPTS, fail
 
-try:
-    import joblib
-except ModuleNotFoundError:
-    fail("joblib is missing; pip install -r requirements-experiments.txt")
-
 
 @dataclass(frozen=True)
 class Step:
@@ -234,6 +229,10 @@ def print_list(steps, args):
 
 def run_all(steps, args):
     """Every step, wave by wave, until one fails; returns what went wrong."""
+    try:
+        import joblib
+    except ImportError:
+        fail("joblib is missing; pip install -r requirements-experiments.txt")
     settings = dict(backend="dask") if args.backend == "dask" else dict(backend="loky", n_jobs=args.jobs)
     minutes, failed = {step.name: step.minutes for step in steps}, []
     layout = "{l_bar}{bar}| {remaining} left{postfix}"

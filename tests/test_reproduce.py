@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -117,3 +119,12 @@ def test_the_command_line(settings, capsys):
         with pytest.raises(SystemExit):
             reproduce.main(reproduce.Args(**dict(runs=settings.runs, out=settings.out) | options))
         assert "--" + next(iter(options)) in capsys.readouterr().err
+
+
+def test_without_joblib_the_module_is_imported_and_a_run_says_what_is_missing(tmp_path):
+    code = "import sys; sys.modules['joblib'] = None; from experiments import reproduce; from pathlib import Path; "
+    code += f"print('imported'); here = Path({str(tmp_path)!r}); "
+    code += "reproduce.main(reproduce.Args(only=('critic_cstr_robust',), out=here, runs=here))"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert out.stdout.startswith("imported") and out.returncode == 2
+    assert "requirements-experiments.txt" in out.stderr and "Traceback" not in out.stderr
