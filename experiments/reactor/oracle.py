@@ -1,7 +1,7 @@
 """How far each controller of the reactor is from the best possible: one optimal control problem over the whole episode for each draw.
 
     python experiments/reactor/deploy.py --jobs 2      # first: the controllers, whose trajectories are guesses
-    python experiments/reactor/oracle.py --jobs 2      # twenty minutes; continues where it stopped
+    python experiments/reactor/oracle.py --jobs 2      # half an hour; continues where it stopped
     python experiments/reactor/oracle.py --plot-only   # print the tables from the committed CSV
 
 The oracle knows the plant's parameters and the whole episode, and maximises the evaluation's own time near goal minus a slack penalty of 1
