@@ -26,7 +26,7 @@ import envs
 import goal_mpc as gm
 from envs import linear
 from experiments import common
-from experiments.common import column, distinct, rounded
+from experiments.common import column, distinct, rounded, select
 from experiments.palette import BLUE, RED
 
 DIMENSIONS = (2, 4, 8, 16, 32)
@@ -283,10 +283,9 @@ def plot_jensen(rows, path):
     print("\neq:jensen on the closed loops, logarithms, medians: left side, right side, smallest margin,")
     print("indicator sum (|x| <= 0.1)")
     for objective, (name, colour, marker) in CONTROLLERS.items():
+        mine = [select(rows, controller=objective, n=n) for n in dimensions]
         keys = ("jensen_log_left", "jensen_log_right", "log_indicator")
-        left, right, near = (
-            [column(rows, key, controller=objective, n=n) for n in dimensions] for key in keys
-        )
+        left, right, near = ([column(part, key) for part in mine] for key in keys)
         margins = [r - v for v, r in zip(left, right)]
         draw_bands(axes[0], dimensions, margins, colour, "-" + marker, name)
         style = dict(color=colour, marker=marker, lw=2)
@@ -335,7 +334,7 @@ def plot_sweep(rows, path):
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(-np.arange(len(variants)), variants)
     axes[0].set_ylim(0.5 - len(variants), 0.5)
-    common.legend(fig, axes[0], ncols=2)
+    common.legend(fig, axes[0], ncols=2, fontsize=10)
     common.save(fig, path)
 
 

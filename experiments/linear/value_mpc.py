@@ -246,9 +246,7 @@ def profile(args):
     rows, curves = collect(args, CONTROLLERS, (args.horizon,)), []
     for label in CONTROLLERS:
         mine = select(rows, controller=label)
-        norms, times = (
-            np.array([np.fromstring(row[k], sep=" ") for row in mine]) for k in ("norms", "times")
-        )
+        norms, times = (np.array([row[key].split() for row in mine], float) for key in ("norms", "times"))
         for t in range(norms.shape[1]):
             late = min(t, times.shape[1] - 1)  # no action is computed at the last state: its time is repeated
             curve = quantiles("norm", norms[:, t]) | quantiles("ms", times[:, late])
@@ -258,10 +256,8 @@ def profile(args):
 
 
 def print_profile(rows, labels):
-    head = (
-        f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}{'ms median':>11s}"
-    )
-    print(f"{head}{'first 5':>9s}{'worst':>8s}{'failed':>8s}")
+    head = f"{'':42s}{'steps not near':>22s}{'l2 error':>22s}{'violation':>10s}{'|x_50|':>9s}"
+    print(f"{head}{'ms median':>11s}{'first 5':>9s}{'worst':>8s}{'failed':>8s}")
     for label in labels:
         mine, text = select(rows, controller=label), f"{label:42s}"
         for key in ("steps_not_near", "l2_error"):
@@ -272,12 +268,11 @@ def print_profile(rows, labels):
         worst, failed = column(mine, "solve_ms_max").max(), column(mine, "solver_failures").sum()
         print(f"{text}{violation:10.2f}{end:9.4f}{ms:11.1f}{early:9.1f}{worst:8.0f}{failed:8.0f}")
     for label in labels[3:]:
-        keys = ("solve_ms_median", "solve_ms_transient")
-        mine, plain = (
-            [np.median(column(rows, k, controller=name)) for k in keys] for name in (label, NO_VALUE)
-        )
-        ratios = f"median {mine[0] / plain[0]:.2f}, first five steps {mine[1] / plain[1]:.2f}"
-        print(f"{label}: solve time over that without a value, {ratios}")
+        text = f"{label}: solve time over that without a value"
+        for key, name in (("solve_ms_median", "median"), ("solve_ms_transient", "first five steps")):
+            mine, plain = (np.median(column(rows, key, controller=each)) for each in (label, NO_VALUE))
+            text += f", {name} {mine / plain:.2f}"
+        print(text)
     actor, *others = (column(rows, "steps_not_near", controller=label) for label in labels)
     for label, steps in zip(labels[1:], others):
         gain = actor - steps  # paired by system and start

@@ -102,7 +102,7 @@ def plot(rows, path):
         ax.set_ylim(bottom=0)
         ax.grid(axis="y", alpha=0.3)
     axes[0].set_title(f"{len(mine)} starts per controller; bars: medians", fontsize=10)
-    common.legend(fig, axes[0], ncols=3)
+    common.legend(fig, axes[0], ncols=3, fontsize=10)
     common.save(fig, path)
 
 

@@ -123,7 +123,7 @@ def plot(rows, path):
     axes[0].set_yticks(-np.arange(len(labels)), labels)
     for name, (_, colour, marker) in SHOWN.items():
         axes[0].plot([], [], marker=marker, color=colour, label=name)
-    common.legend(fig, axes[0], ncols=2, title="bar: all draws; points: each of the critics")
+    common.legend(fig, axes[0], ncols=2, fontsize=10, title="bar: all draws; points: each of the critics")
     common.save(fig, path)
 
 

@@ -169,11 +169,9 @@ def cases(args):
 
 
 def print_loops(rows):
-    head = (
-        f"{'case':9s}{'noise':>6s}{'gain':>5s} {'controller':36s}{'draws':>6s}{'offset %: median  95 %':>24s}"
-    )
-    head += f"{'near goal: median  5 %':>24s}{'outside: median  5 %':>22s}{'steps over 2 %':>16s}{'ms':>7s}"
-    print(head)
+    head = f"{'case':9s}{'noise':>6s}{'gain':>5s} {'controller':36s}{'draws':>6s}"
+    head += f"{'offset %: median  95 %':>24s}{'near goal: median  5 %':>24s}{'outside: median  5 %':>22s}"
+    print(f"{head}{'steps over 2 %':>16s}{'ms':>7s}")
     keys = ("offset", "time_near_goal", "time_outside_constraints", "steps_over_2_percent", "solve_ms_median")
     for (case, noise, gain, controller), mine in grouped(rows, "case", "noise", "gain", "controller").items():
         offset, near, outside, over, ms = (column(mine, key) for key in keys)

@@ -112,10 +112,8 @@ def best(cell):
     episode, seed, steps, weights, guesses = cell
     x0, psi = (found[episode] for found in draws(cstr, episode + 1, seed))
     guesses = {label: np.array(u) for label, u in guesses} | {"held state": None}
-    known, solves = (
-        {},
-        {weight: [] for weight in weights},
-    )  # best solution; every solve's objective, None if it failed
+    known = {}  # weight: its best solution
+    solves = {weight: [] for weight in weights}  # objective of every solve, None if it failed
 
     def improve(weight, guesses):
         for label, guess in guesses.items():

@@ -125,14 +125,8 @@ def print_table(rows):
     stuck, draws = [row for row in rows if near[row["episode"]] < NEAR], len(near)
     which = f"{len(distinct(stuck, 'episode'))} of {draws} draws"
     print(f"medians over the {which} in which IPOPT is near the goal for less than {NEAR:g} steps")
-    columns = (
-        "time_near_goal",
-        "time_outside_constraints",
-        "gain",
-        "iterations",
-        "solve_ms_median",
-        "unsolved",
-    )
+    columns = ["time_near_goal", "time_outside_constraints", "gain", "iterations"]
+    columns += ["solve_ms_median", "unsolved"]
     print(f"{'':32s}" + "".join(f"{name.replace('_', ' '):>26s}" for name in columns))
     for label in EXPERIMENTS:
         medians = (np.median(column(stuck, name, variant=label)) for name in columns)

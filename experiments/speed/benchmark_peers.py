@@ -387,11 +387,11 @@ def cells(args):
     found = []
     for env, horizon, kind, peer in CELLS:
         python = (args.peers if "l4casadi" in peer else args.peers_new).absolute() / "bin/python"
-        few = kind == "trained"
-        starts, steps = (
-            min(args.starts, 3 if env == "cstr" and not few else 2),
-            min(args.steps, 5) if few else args.steps,
-        )
+        starts, steps = args.starts, args.steps
+        if env == "double_pendulum" or kind == "trained":
+            starts = min(starts, 2)
+        if kind == "trained":
+            steps = min(steps, 5)
         if args.quick:
             starts, steps = 1, 2
         if not args.quick or (env, horizon, kind) == ("cstr", 1, "random"):

@@ -87,11 +87,9 @@ def build(problem):
     u = ca.vertcat(*(model.set_variable("_u", name) for name in plant.ACTION_NAMES))
     psi = ca.vertcat(*(model.set_variable("_p", name) for name in plant.PSI_NAMES))
     xs, us, psis = (ca.SX.sym(name, v.numel()) for name, v in (("x", x), ("u", u), ("psi", psi)))
-    rhs = (
-        envs.rk4(plant.ode, xs, us, psis, dt, plant.MODEL_SUBSTEPS, ca)
-        if discrete
-        else plant.ode(xs, us, psis, ca)
-    )
+    rhs = plant.ode(xs, us, psis, ca)
+    if discrete:
+        rhs = envs.rk4(plant.ode, xs, us, psis, dt, plant.MODEL_SUBSTEPS, ca)
     rhs = ca.Function("rhs", [xs, us, psis], [rhs])(x, u, psi)
     for i, name in enumerate(plant.STATE_NAMES):
         model.set_rhs(name, rhs[i])
@@ -121,11 +119,8 @@ def build(problem):
             collocation_deg=problem["degree"],
             collocation_ni=1,
         )
-    goal, error = (
-        np.array(problem["goal"]),
-        plant.goal_error(x[plant.GOAL_INDEX], np.array(problem["goal"]), ca),
-    )
-    stage = ca.sumsqr(error)
+    goal = np.array(problem["goal"])
+    stage = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], goal, ca))
     if problem["sigma2"]:
         stage = -ca.exp(-stage / (2 * problem["sigma2"]))
     terminal = stage
