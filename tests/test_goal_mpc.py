@@ -617,8 +617,8 @@ def test_default_arguments_are_accepted():
     assert plant.name == "double_pendulum" and goals.shape == (5, 2)
 
 
-def test_an_interrupt_ends_the_program_at_once():
-    command = [sys.executable, "-u", "goal_mpc.py", "--no-compile", "--steps", "100000"]
+def test_an_interrupt_ends_the_program_at_once(tmp_path):
+    command = [sys.executable, "-u", "goal_mpc.py", "--no-compile", "--steps", "100000", "--out", str(tmp_path)]
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
