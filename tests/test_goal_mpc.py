@@ -618,7 +618,8 @@ def test_default_arguments_are_accepted():
 
 
 def test_an_interrupt_ends_the_program_at_once(tmp_path):
-    command = [sys.executable, "-u", "goal_mpc.py", "--no-compile", "--steps", "100000", "--out", str(tmp_path)]
+    script = [sys.executable, "-u", "goal_mpc.py"]
+    command = [*script, "--no-compile", "--steps", "100000", "--out", str(tmp_path)]
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
