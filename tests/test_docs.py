@@ -68,7 +68,8 @@ def test_every_command_of_the_three_scripts_runs(script, words, checkpoint, tmp_
         words = [word.replace("runs/NAME", run) for word in words]
         assert (sac_her_branching.main(tyro.cli(module.Args, args=words)) / "checkpoint.pt").exists()
         return
-    words = [word.replace("runs/NAME/checkpoint.pt", str(checkpoint)) for word in words]
+    trained = {"latest": str(checkpoint)}
+    words = [trained.get(word, word.replace("runs/NAME/checkpoint.pt", str(checkpoint))) for word in words]
     shorter = {"@120": "@2", "@240": "@4", "360": "6"}
     words = [re.sub("@120|@240|^360$", lambda match: shorter[match[0]], word) for word in words]
     args = tyro.cli(module.Args, args=words)
