@@ -370,7 +370,7 @@ class ScenarioMPC(Controller):
         known += self.estimator.disturbance, self.estimator.mismatch
         return *known, self.slack_price, self.change_weight, u_before
 
-    def _guesses(self, x):
+    def first_guesses(self, x):
         """First guesses by name, (inner, n_u)."""
         found = {}
         if self.plan is not None:
@@ -424,16 +424,13 @@ class ScenarioMPC(Controller):
 
     def action(self, x, tick):
         self.problem = self._problem(x)
-        guesses = self._guesses(x)
+        guesses = self.first_guesses(x)
         costs = {name: cost for name, u in guesses.items() if np.isfinite(cost := self._cost(u))}
         if not costs:
             self.plan, self.stats["fell_back"] = None, True
-            u = (
-                call(self.policy, x, self.goals[:, 0], self.estimator.mismatch)
-                if self.policy is not None
-                else np.nan
-            )
-            return np.array(u).ravel()
+            if self.policy is None:
+                return np.array([np.nan])
+            return np.array(call(self.policy, x, self.goals[:, 0], self.estimator.mismatch)).ravel()
         best = min(costs, key=costs.get)
         self.stats |= dict(rung="plan", guess=best, guess_cost=costs[best], stop="limit", predicted=0.0)
         self.plan, self.stats["cost"] = self.improve(guesses[best], costs[best], tick)

@@ -54,6 +54,7 @@ def training(name, *arguments, minutes=1.0):
 
 
 RUNS = ("runs",)
+TWO_CORES = dict(alone=True, takes=RUNS)  # has processes of its own
 CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
 STEPS = [
     training("cstr_robust", "--env", "cstr"),
@@ -87,15 +88,15 @@ STEPS = [
     study("reliability", "trust/reliability", "controllers", 20, CRITICS),
     study("reliability", "trust/reliability", "training", 10),
     study("reliability", "trust/reliability", "checkpoints", 2),
-    study("reliability", "trust/reliability", "deployments", 15, CRITICS, alone=True),
+    study("reliability", "trust/reliability", "deployments", 15, CRITICS),
     study("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
     study("dip_performance", "pendulum/performance", minutes=30, alone=True),
     study("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
     study("linear_value_mpc", "linear/value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
     study("solve_time", "speed/solve_time", minutes=10, needs=CRITICS, alone=True, takes=()),
-    study("training_speed", "speed/training_speed", "profile", 1, alone=True),
-    study("training_speed", "speed/training_speed", "ablation", 40, ["training_speed_profile"], alone=True),
-    study("training_speed", "speed/training_speed", "peer", 60, ["training_speed_ablation"], alone=True),
+    study("training_speed", "speed/training_speed", "profile", 1, **TWO_CORES),
+    study("training_speed", "speed/training_speed", "ablation", 20, ["training_speed_profile"], **TWO_CORES),
+    study("training_speed", "speed/training_speed", "peer", 30, ["training_speed_ablation"], **TWO_CORES),
     study("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True, takes=RUNS),
 ]
 
@@ -238,6 +239,7 @@ def run_all(steps, args):
     layout = "{l_bar}{bar}| {remaining} left{postfix}"
     with tqdm(total=sum(minutes.values()), disable=None, bar_format=layout) as bar:
         for wave in waves(steps):
+            wave = sorted(wave, key=lambda step: -step.minutes)  # so that all processes end at about one time
             with joblib.parallel_config(**settings):
                 calls = (joblib.delayed(run)(step, args, note(step, args)) for step in wave)
                 for name, error in joblib.Parallel(return_as="generator_unordered")(calls):

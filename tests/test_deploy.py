@@ -85,8 +85,8 @@ def mpc(
 class Shifted(deploy.ScenarioMPC):
     """Guesses the shifted plan alone where there is one."""
 
-    def _guesses(self, x):
-        found = super()._guesses(x)
+    def first_guesses(self, x):
+        found = super().first_guesses(x)
         return {"shifted": found["shifted"]} if "shifted" in found else found
 
 

@@ -56,12 +56,10 @@ class Given(deploy.ScenarioMPC):
 
     given = None
 
-    def _guesses(self, x):
-        return (
-            super()._guesses(x)
-            if self.given is None
-            else {"given": (self.given - self.u_center) / self.u_scale}
-        )
+    def first_guesses(self, x):
+        if self.given is None:
+            return super().first_guesses(x)
+        return {"given": (self.given - self.u_center) / self.u_scale}
 
     def improve(self, u, cost, tick):
         self.started = u.copy()

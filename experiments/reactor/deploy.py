@@ -1,6 +1,6 @@
 """Figures `cstr_rlmpc` and `full_cstr_rlmpc`: every controller of the reactor on paired draws of start state and plant.
 
-    python experiments/reactor/deploy.py --jobs 2                   # 200 draws, 50 minutes; continues where it stopped
+    python experiments/reactor/deploy.py --jobs 2                   # 200 draws, a quarter of an hour; continues where it stopped
     python experiments/reactor/deploy.py --study critics --jobs 2   # the same claim with critics of other training seeds, which it trains
     python experiments/reactor/deploy.py --study ipopt --jobs 2     # the same problems solved by IPOPT
     python experiments/reactor/deploy.py --study literal --jobs 2   # the authors' conventions and eq:QMPC's sum beside ours, all by IPOPT
@@ -29,7 +29,7 @@ from experiments.reactor.tune import TUNED, TUNED_IPOPT
 NOMINAL, ROBUST = dict(controllers=("nominal_mpc",)), dict(controllers=("robust_mpc",))
 IPOPT, ONE, HARD = dict(like="ipopt"), dict(iterations=1), dict(constraints="hard")
 HORIZONS = (0, 1, 2, 5, 10)
-DRAWS = {"deploy": 200, "branching": 20}  # else 50
+DRAWS = {"deploy": 200, "ipopt": 25, "branching": 20}  # else 50
 CONVENTIONS = {
     "this repository's problem": IPOPT,
     "slack summed over scenarios": IPOPT | dict(slack_weight=9.0),
@@ -90,7 +90,7 @@ class Args(common.ParallelArgs):
     """deploy: the controllers against each other; critics: of other training seeds; ipopt: by another solver; literal: conventions of the
     authors' code; branching: trees that branch at more stages"""
     episodes: int | None = None
-    """paired draws; default: 200, of branching 20, in the other studies 50"""
+    """paired draws; default: 200, of ipopt 25, of branching 20, of the others 50"""
 
 
 def variants(args):

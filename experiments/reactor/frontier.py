@@ -52,7 +52,7 @@ DRAWN = {
 
 @dataclass(frozen=True)
 class Args(common.ParallelArgs):
-    episodes: int = 50
+    episodes: int = 25
     """paired draws, at most as many as deploy.py had"""
 
 

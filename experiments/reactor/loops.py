@@ -77,8 +77,8 @@ def loops(variants, episodes, seed, quick=False):
 class OneStart(deploy.ScenarioMPC):
     """Improves the shifted last plan alone: the actor gives the first guess of an episode, and none after it."""
 
-    def _guesses(self, x):
-        found = super()._guesses(x)
+    def first_guesses(self, x):
+        found = super().first_guesses(x)
         return {"shifted": found["shifted"]} if "shifted" in found else found
 
 

@@ -5,7 +5,7 @@
     python experiments/reactor/oracle.py --plot-only   # print the tables from the committed CSV
 
 The oracle knows the plant's parameters and the whole episode, and maximises the evaluation's own time near goal minus a slack penalty of 1
-or 5 per mol/l or degC and step (on the first 50 draws 0.3 to 100, for the frontier). The problem has local optima: it is solved from
+or 5 per mol/l or degC and step (on the first 25 draws 0.3 to 100, for the frontier). The problem has local optima: it is solved from
 the trajectory of every controller, from a held state, and from the solutions for the neighbouring weights, and the best of these solves is
 kept.
 
@@ -35,7 +35,7 @@ from experiments.reactor import literal, loops
 from experiments.reactor.deploy import STUDIES, summary
 
 WEIGHTS, FRONTIER = (1.0, 5.0), (0.3, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0)
-FRONTIER_DRAWS = 50
+FRONTIER_DRAWS = 25
 UNSEEN = 50  # draws from here on took no part in the choice of the default's weights
 N_X, N_PSI = len(cstr.X_LOW), len(cstr.PSI_NOMINAL)
 DEFAULT = "RL+MPC, constraint-aware, N = 5"

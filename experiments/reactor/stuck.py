@@ -85,7 +85,7 @@ class IpoptSecond(Second, literal.IpoptMPC):
 
 
 class AnytimeSecond(Second, deploy.ScenarioMPC):
-    def _guesses(self, x):
+    def first_guesses(self, x):
         return {"IPOPT": (np.hstack(self.actions(x)).T - self.u_center) / self.u_scale}
 
 

@@ -1,8 +1,8 @@
 """Where the training time of the CSTR agent goes, what its settings buy, and Stable-Baselines3's SAC + HER on the same environment.
 
-    python experiments/speed/training_speed.py --study ablation --jobs 2    # half an hour: one setting changed at a time, 5 seeds
-    python experiments/speed/training_speed.py --study peer --jobs 2        # an hour: Stable-Baselines3 (requirements-dev.txt), 3 seeds
-    python experiments/speed/training_speed.py --study profile              # a minute: the parts of one update; nothing else should run
+    python experiments/speed/training_speed.py --study ablation    # twenty minutes: one setting changed at a time, 5 seeds
+    python experiments/speed/training_speed.py --study peer        # half an hour: Stable-Baselines3 (requirements-dev.txt), 3 seeds
+    python experiments/speed/training_speed.py --study profile     # a minute: the parts of one update; nothing else should run
     python experiments/speed/training_speed.py --study ablation --plot-only
 
 Runs are told apart by variant and seed and kept, so that a second call continues. Times are of training alone, evaluations left out, one
@@ -62,7 +62,7 @@ class Args(common.ParallelArgs):
     """ablation: settings of sac_her_branching.py; peer: Stable-Baselines3; profile: one update, part by part"""
     seeds: int = 5
     """training seeds per variant (peer: 3 at most)"""
-    jobs: int = 1
+    jobs: int = 2
     """runs at a time, each on one thread"""
 
 
