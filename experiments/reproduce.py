@@ -6,17 +6,19 @@
     python experiments/reproduce.py --only cstr_deploy             # one step, after what it needs
     python experiments/reproduce.py --backend dask --scheduler tcp://HOST:8786    # on a cluster whose workers share this folder
 
-A step is one command. Steps that do not need each other run side by side (joblib), those that measure times one by one at the end. A
-finished step leaves a note under --runs and is not repeated until a script changes; what an interrupted step had finished is kept
-as well, by the experiment itself. A command that a lost worker leaves behind does no harm: results appear by an atomic rename.
+A step is one command. Steps that do not need each other run side by side, those that measure times one by one at the end. A finished
+step leaves a note under --runs and is not repeated until a script changes; what an interrupted step had finished is kept as well, by the
+experiment itself. A command that a lost worker leaves behind does no harm: results appear by an atomic rename.
 """
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -56,39 +58,39 @@ def training(name, *arguments, minutes=1.0):
 RUNS = ("runs",)
 TWO_CORES = dict(alone=True, takes=RUNS)  # has processes of its own
 CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
-STEPS = [
+STEPS = [  # what others wait for and what takes long first
     training("cstr_robust", "--env", "cstr"),
     training("cstr_nominal", "--env", "cstr", "--scenarios", "nominal"),
     training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
     training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
     training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
-    study("dip_equilibria", "pendulum/equilibria", minutes=2, takes=()),
-    study("linear_scalability", "linear/scalability", "main", 15),
-    study("linear_scalability", "linear/scalability", "sweep", 30, ["linear_scalability_main"]),
     study("linear_value_mpc", "linear/value_mpc", "train", 70),
     study("linear_value_mpc", "linear/value_mpc", "distance", 20, ["linear_value_mpc_train"]),
+    study("cstr_deploy", "reactor/deploy", minutes=26, needs=CRITICS),
+    study("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
+    study("cstr_oracle", "reactor/oracle", minutes=62, needs=["cstr_deploy"]),
+    study("cstr_frontier", "reactor/frontier", minutes=6, needs=["cstr_oracle"]),
+    study("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
+    study("cstr_tune", "reactor/tune", minutes=86, needs=CRITICS),
     study("cstr_training", "reactor/training", minutes=25),
     study("cstr_offline", "reactor/offline", minutes=2, needs=["cstr_training"]),
     study("cstr_offline", "reactor/offline", "ablation", 30, ["cstr_training"]),
     study("cstr_offset_free", "reactor/offset_free", "training", 40, ["cstr_offline"]),
     study("cstr_offset_free", "reactor/offset_free", "loops", 60, CRITICS),
-    study("cstr_tune", "reactor/tune", minutes=86, needs=CRITICS),
-    study("cstr_profile", "reactor/trajectories", needs=CRITICS, takes=()),
-    study("cstr_deploy", "reactor/deploy", minutes=26, needs=CRITICS),
-    study("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
+    study("cstr_stuck", "reactor/stuck", minutes=24, needs=CRITICS),
     study("cstr_deploy", "reactor/deploy", "ipopt", 40, CRITICS),
     study("cstr_deploy", "reactor/deploy", "literal", 10, CRITICS),
     study("cstr_deploy", "reactor/deploy", "branching", 5, CRITICS),
-    study("cstr_oracle", "reactor/oracle", minutes=62, needs=["cstr_deploy"]),
-    study("cstr_frontier", "reactor/frontier", minutes=6, needs=["cstr_oracle"]),
-    study("cstr_stuck", "reactor/stuck", minutes=24, needs=CRITICS),
-    study("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
     study("cstr_shift", "reactor/shift", "plants", 12, CRITICS),
     study("cstr_shift", "reactor/shift", "critic", 2, CRITICS),
+    study("cstr_profile", "reactor/trajectories", needs=CRITICS, takes=()),
+    study("linear_scalability", "linear/scalability", "main", 15),
+    study("linear_scalability", "linear/scalability", "sweep", 30, ["linear_scalability_main"]),
     study("reliability", "trust/reliability", "controllers", 20, CRITICS),
     study("reliability", "trust/reliability", "training", 10),
     study("reliability", "trust/reliability", "checkpoints", 2),
     study("reliability", "trust/reliability", "deployments", 15, CRITICS),
+    study("dip_equilibria", "pendulum/equilibria", minutes=2, takes=()),
     study("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
     study("dip_performance", "pendulum/performance", minutes=30, alone=True),
     study("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
@@ -142,9 +144,9 @@ def write(text, path):
 
 
 def run(step, args, done):
-    """One step, in a process of its own, unless its note `done` is there. Returns its name and what went wrong, or None."""
+    """One step, in a process of its own, unless its note `done` is there. Returns what went wrong, or None."""
     if done.exists():
-        return step.name, None
+        return None
     tick, critic = time.time(), step.name.startswith("critic_")
     command = [sys.executable, *step.command]
     if critic:
@@ -158,7 +160,7 @@ def run(step, args, done):
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
     result = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", env=one_thread)
     if result.returncode:
-        return step.name, f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
+        return f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
     if critic:
         target = args.out / f"pretrained/{step.name.removeprefix('critic_')}.pt"
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -166,7 +168,6 @@ def run(step, args, done):
         shutil.rmtree(trained)
     write(result.stdout, args.runs / f"logs/{step.name}.txt")
     write(json.dumps({"seconds": time.time() - tick}), done)
-    return step.name, None
 
 
 def wanted(steps, only):
@@ -185,15 +186,15 @@ def wanted(steps, only):
     return [step for step in steps if step.name in chosen]
 
 
-def waves(steps):
-    """Lists of steps that may run side by side, one after another: first what need not be alone, as early as its needs allow."""
-    done, left = set(), list(steps)
-    while left:
-        ready = [step for step in left if done.issuperset(step.needs)]
-        wave = [step for step in ready if not step.alone] or ready[:1]
-        yield wave
-        done |= {step.name for step in wave}
-        left = [step for step in left if step.name not in done]
+def startable(left, done, running):
+    """Those of the steps left that may start now, in order: what measures times waits for all others and runs by itself."""
+    if any(step.alone for step in running):
+        return []
+    ready = [step for step in left if done.issuperset(step.needs)]
+    beside = [step for step in ready if not step.alone]
+    if not beside and not running and all(step.alone for step in left):
+        return ready[:1]
+    return beside
 
 
 def checked(args):
@@ -228,27 +229,43 @@ def print_list(steps, args):
     print(f"minutes of one process; about {hours:.1f} hours are left with --jobs {args.jobs}")
 
 
-def run_all(steps, args):
-    """Every step, wave by wave, until one fails; returns what went wrong."""
-    try:
-        import joblib
-    except ImportError:
-        fail("joblib is missing; pip install -r requirements-experiments.txt")
-    settings = dict(backend="dask") if args.backend == "dask" else dict(backend="loky", n_jobs=args.jobs)
-    minutes, failed = {step.name: step.minutes for step in steps}, []
+def run_all(steps, args, pool):
+    """Every step, each as soon as it may start, until one fails; returns what went wrong."""
+    left, running, done, failed = list(steps), {}, set(), []
     layout = "{l_bar}{bar}| {remaining} left{postfix}"
-    with tqdm(total=sum(minutes.values()), disable=None, bar_format=layout) as bar:
-        for wave in waves(steps):
-            wave = sorted(wave, key=lambda step: -step.minutes)  # so that all processes end at about one time
-            with joblib.parallel_config(**settings):
-                calls = (joblib.delayed(run)(step, args, note(step, args)) for step in wave)
-                for name, error in joblib.Parallel(return_as="generator_unordered")(calls):
-                    bar.set_postfix_str(f", {name} {'failed' if error else 'done'}")
-                    bar.update(minutes[name])
-                    failed += [f"{name}: {error}"] if error else []
-            if failed:
-                break
+    with tqdm(total=sum(step.minutes for step in steps), disable=None, bar_format=layout) as bar:
+        while running or (left and not failed):
+            ready = [] if failed else startable(left, done, running.values())
+            # a cluster has a queue of its own
+            for step in ready[: args.jobs - len(running) if args.backend == "processes" else None]:
+                left.remove(step)
+                running[pool.submit(run, step, args, note(step, args))] = step
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                step, error = running.pop(future), future.result()
+                bar.set_postfix_str(f", {step.name} {'failed' if error else 'done'}")
+                bar.update(step.minutes)
+                done.add(step.name)
+                failed += [f"{step.name}: {error}"] if error else []
     return failed
+
+
+@contextlib.contextmanager
+def executor(args):
+    """Where `run` is called: threads, since a step is a process of its own, or the workers of the cluster."""
+    if args.backend == "processes":
+        with ThreadPoolExecutor(args.jobs) as pool:
+            yield pool
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        fail("dask is missing; pip install -r requirements-experiments.txt")
+    try:
+        client = Client(args.scheduler, timeout=20)
+    except (OSError, ValueError) as error:
+        fail(f"--scheduler {args.scheduler} does not answer ({error})")
+    with client:
+        yield client.get_executor(pure=False)
 
 
 def main(args, steps=STEPS):
@@ -261,16 +278,8 @@ def main(args, steps=STEPS):
         steps = [replace(step, alone=False) for step in steps]
     if args.list:
         return print_list(steps, args)
-    if args.backend == "dask":
-        from dask.distributed import Client
-
-        try:
-            client = Client(args.scheduler, timeout=20)  # joblib's dask backend finds it
-        except (OSError, ValueError) as error:
-            fail(f"--scheduler {args.scheduler} does not answer ({error})")
-    failed = run_all(steps, args)
-    if args.backend == "dask":
-        client.close()
+    with executor(args) as pool:
+        failed = run_all(steps, args, pool)
     if failed:
         fail("\n\n".join(failed))
     print(f"{len(steps)} steps done; results in {args.out}")

@@ -1,12 +1,8 @@
 """The whole reproduction: what it runs, in which order, and that nothing is lost on the way."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -15,13 +11,14 @@ from experiments import reproduce
 
 ROOT = Path(__file__).parent.parent
 
-# notes when it began in a file of its own, works for a while, writes a result
+# notes when it began in a file of its own, writes a result; "killer" kills who called it, at its first call
 WORK = """
-import os, sys, time
+import os, signal, sys
 from pathlib import Path
 name, out = sys.argv[1], Path(sys.argv[sys.argv.index("--out") + 1])
 (out / f"{name}.{os.getpid()}.started").touch()
-time.sleep(1.0)
+if name == "killer" and len(list(out.glob("killer.*.started"))) == 1:
+    os.kill(os.getppid(), signal.SIGKILL)
 temporary = out / f"{name}.{os.getpid()}"
 temporary.write_text(name)
 temporary.replace(out / f"{name}.csv")
@@ -63,13 +60,18 @@ def test_every_table_and_figure_has_a_step():
     assert trained == {path.stem for path in (ROOT / "experiments/pretrained").glob("*.pt")}
 
 
-def test_waves_respect_needs_and_leave_alone_what_measures_times():
-    done = set()
-    for wave in reproduce.waves(reproduce.STEPS):
-        assert all(done.issuperset(step.needs) for step in wave)
-        assert len(wave) == 1 or not any(step.alone for step in wave)
-        done |= {step.name for step in wave}
-    assert len(done) == len(reproduce.STEPS)
+def test_steps_wait_for_their_needs_and_what_measures_times_runs_by_itself():
+    """Whatever ends first: here the last that began, or the first."""
+    for ends in (-1, 0):
+        left, running, done = list(reproduce.STEPS), [], set()
+        while left or running:
+            for step in reproduce.startable(left, done, running)[: 3 - len(running)]:
+                assert done.issuperset(step.needs)
+                left.remove(step)
+                running.append(step)
+            assert running and (len(running) == 1 or not any(step.alone for step in running))
+            done.add(running.pop(ends).name)
+        assert len(done) == len(reproduce.STEPS)
     chosen = [step.name for step in reproduce.wanted(reproduce.STEPS, ("cstr_frontier",))]
     assert chosen == [*reproduce.CRITICS, "cstr_deploy", "cstr_oracle", "cstr_frontier"]
 
@@ -84,24 +86,16 @@ def test_a_finished_step_is_not_repeated_and_a_failed_one_is(settings, capsys):
 
 
 def test_a_lost_worker_loses_no_result_and_doubles_none(settings):
-    from dask.distributed import Client, LocalCluster
+    from dask.distributed import LocalCluster
 
-    names = [f"s{i}" for i in range(8)]
+    names = ["s0", "s1", "killer", "s3", "s4", "s5"]
     with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
         settings.backend, settings.scheduler = "dask", cluster.scheduler_address
-        thread = threading.Thread(target=reproduce.main, args=(settings, steps(settings, *names)))
-        thread.start()
-        while len(started(settings)) < 3:
-            time.sleep(0.05)
-        with Client(cluster) as client:
-            victim = next(iter(client.run(os.getpid).values()))
-        os.kill(victim, signal.SIGKILL)
-        thread.join(timeout=60)
-        assert not thread.is_alive()
-    assert {path.stem: path.read_text() for path in settings.out.glob("*.csv")} == {
-        name: name for name in names
-    }
-    assert len(list((settings.runs / "done").iterdir())) == len(names) and len(started(settings)) > len(names)
+        reproduce.main(settings, steps(settings, *names))
+    results = {path.stem: path.read_text() for path in settings.out.glob("*.csv")}
+    assert results == {name: name for name in names}
+    assert len(list((settings.runs / "done").iterdir())) == len(names)
+    assert started(settings).count("killer") == 2
 
 
 def test_the_command_line(settings, capsys):
@@ -121,10 +115,12 @@ def test_the_command_line(settings, capsys):
         assert "--" + next(iter(options)) in capsys.readouterr().err
 
 
-def test_without_joblib_the_module_is_imported_and_a_run_says_what_is_missing(tmp_path):
-    code = "import sys; sys.modules['joblib'] = None; from experiments import reproduce; from pathlib import Path; "
+def test_a_cluster_needs_dask_and_nothing_else_does(tmp_path):
+    code = "import sys; sys.modules['dask.distributed'] = None; from experiments import reproduce; from pathlib import Path; "
     code += f"print('imported'); here = Path({str(tmp_path)!r}); "
-    code += "reproduce.main(reproduce.Args(only=('critic_cstr_robust',), out=here, runs=here))"
+    code += (
+        "reproduce.main(reproduce.Args(backend='dask', scheduler='tcp://localhost:1', out=here, runs=here))"
+    )
     out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert out.stdout.startswith("imported") and out.returncode == 2
     assert "requirements-experiments.txt" in out.stderr and "Traceback" not in out.stderr
