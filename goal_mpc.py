@@ -4,15 +4,15 @@
 # ///
 """Goal-conditioned scenario MPC written out in CasADi: scenario tree, soft constraints, Gaussian objective (eq:multiMPCobj).
 
-    minimise over u   1/S sum_i { sum_{t=1}^N [ l(x_t^i, g_t) + p'|eps_t^i| + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
+    minimise over u   1/P sum_i { sum_{t=1}^N [ l(x_t^i, g_t) + p'|eps_t^i| + |u_{t-1}^i - u_{t-2}^i|_W^2 ] + m(x_N^i) }
     subject to        x_0^i = s,  x_{t+1}^i = f(x_t^i, u_t^i, psi_t^i),  x_t^i - eps_t^i in X,  u_t^i in U,
                       u_t^i = u_t^j while i and j share their history
 
-Over the robust horizon the paths i take every sequence of scenarios, then each keeps its last. `--objective` chooses
-the stage cost l (Example 1) from the plant's goal error e, for the pendulum 1 - cos(theta - g): goal is
--exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus the potential energy. A
-linear plant has l(x_t, u_t) = |x_t|^2 + |u_t|^2 at t = 0 ... N-1 and m(x_N) = x_N'Px_N (eq:nominalMPCobj); goal takes
--exp of both (eq:jensen).
+Over the robust horizon the P paths i take every sequence of scenarios, then each keeps its last; u_{-1} is the last
+applied action. `--objective` chooses the stage cost l (Example 1) from the plant's goal error e, for the pendulum
+1 - cos(theta - g): goal is -exp(-|e|^2 / (2 sigma^2)) (eq:smoothreward), quadratic |e|^2 / 2, expert the kinetic minus
+the potential energy. A linear plant has l(x_t, u_t) = |x_t|^2 + |u_t|^2 at t = 0 ... N-1 and m(x_N) = x_N'Px_N, both
+about the goal and the action that holds it (eq:nominalMPCobj with gamma = 1); goal takes -exp of both (eq:jensen).
 
     python goal_mpc.py --env double_pendulum --objective goal --horizon 75   # swing both rods up and hold them
     python goal_mpc.py --goal up-down down-up@120 --steps 240 --horizon 35 --sigma2 0.5 --animate   # other equilibria
@@ -180,15 +180,15 @@ class ScenarioMPC(Controller):
         slack = ca.MX.sym("slack", len(below) + len(above), edges)
 
         # dynamics: x_0 = s, x_{t+1} = f(x_t, u_t, psi_t)
-        states = ca.horzcat((x_now - self.x_center) / self.x_scale, x)
+        scaled = ca.horzcat((x_now - self.x_center) / self.x_scale, x)
         parent, psi = tree.parent[1:].tolist(), self.scenarios[tree.scenario[1:]].T
-        dynamics = x - self.model().map(edges)(states[:, parent], u[:, parent], psi)
+        dynamics = x - self.model().map(edges)(scaled[:, parent], u[:, parent], psi)
 
         # constraints: X_LOW <= x + slack, x - slack <= X_HIGH; a hard bound limits the variable itself
         low, high = bounds = (self.bounds - self.x_center) / self.x_scale
         box = ca.vertcat(x[below.tolist(), :] - low[below], high[above] - x[above.tolist(), :]) + slack
         hard = np.where(np.isinf(self.slack_price), bounds, [[-np.inf], [np.inf]])
-        states, actions = states * self.x_scale + self.x_center, u * self.u_scale + self.u_center
+        states, actions = scaled * self.x_scale + self.x_center, u * self.u_scale + self.u_center
 
         # objective: stage costs, terminal cost at the leaves, slack, changes of the actions
         weight, leaves = ca.DM(self.weights()), np.flatnonzero(stage == self.horizon).tolist()
@@ -265,7 +265,7 @@ class ScenarioMPC(Controller):
         return self.vector(np.array(x)[stage[1:]], np.array(u)[stage[: self.tree.inner]])
 
     def first_guesses(self, x0):
-        """Two for a start from nothing, the second for when the first fails."""
+        """For a start from nothing, in order of preference; `action` takes two at most."""
         if hasattr(self.plant, "baseline"):  # the plant's own feedback saves iterations
             yield self.rolled_out(x0, lambda t, x: self.plant.baseline(x, self.goals[:, t]))
         yield self.held(x0)

@@ -25,7 +25,7 @@ trajectories.npz and episode.png. Only the folder `envs/` is needed beside this 
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -50,10 +50,8 @@ from envs.script.figure import draw_episode
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
 HARD_PRICE = 1e3  # of a hard bound per physical unit: above the multipliers, so that it is an exact penalty
 HARDLY_MOVED = 0.03  # half-widths of the box of initial states
-SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that lowers the cost as promised
-STATIONARY = (
-    1e-4  # share of the cost: a plan whose cost came this close to the predicted one is left as it is
-)
+SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that keeps a tenth of its promise
+STATIONARY = 1e-4  # share of the cost: a plan that came this close to the predicted cost is left as it is
 Name = Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"]
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC"}
 LABELS |= {"goal_mpc": "RL+MPC, no value", "rl_mpc": "RL+MPC"}
@@ -211,7 +209,7 @@ class ScenarioMPC(Controller):
     A plan is its actions, one per node that has children; the states follow by rolling the tree out. An iteration
     linearises the dynamics about the plan, replaces the Hessian of every node's cost by its positive part, solves
     the tree's quadratic program (envs/control/tree_qp.c), and takes the largest share 1, 1/2, 1/4 ... of its step
-    that lowers the true cost as promised, which the new plan's rollout tells. So whenever it stops,
+    that lowers the true cost by a tenth of what the program promised. So whenever it stops,
 
     - the plan satisfies the dynamics and the limits of the actions,
     - and costs no more than the cheapest finite first guess: the last plan shifted by a sampling time, where the
@@ -265,14 +263,17 @@ class ScenarioMPC(Controller):
         bounds = (np.array([plant.X_LOW, plant.X_HIGH]) - self.x_center) / self.x_scale
         active = np.isfinite(bounds) & (price > 0)
         self.rows = np.flatnonzero(active.any(axis=0))
-        self.slack_price = (np.where(active, np.minimum(price, HARD_PRICE), 0) * self.x_scale)[:, self.rows]
+        self.slack_price = (np.where(active, np.where(np.isinf(price), HARD_PRICE, price), 0) * self.x_scale)[
+            :, self.rows
+        ]
         self.low, self.high = np.where(active, bounds, [[-1e9], [1e9]])[:, self.rows]
         self.change_weight = change_weight * self.u_scale**2
         self.qp = tree_qp(self.tree, len(plant.X_LOW), len(plant.U_LOW), active, change_weight.any(), compile)
         super().__init__(plant, goal, estimator)
         functions = self._functions(stage_cost, value, expansion)
         functions = compiled_functions(functions) if compile else functions
-        self.rollout, self.linearise, *self.follow = map(OnArrays, functions)
+        self.rollout, self.linearise, *follow = map(OnArrays, functions)
+        self.follow = follow[0] if follow else None
 
     def _functions(self, stage_cost, value, expansion):
         """CasADi functions of what `_problem` gives, scaled, a column per node but the root.
@@ -344,13 +345,13 @@ class ScenarioMPC(Controller):
         found, actions = (call(self.policy, state, g, m) - self.u_center) / self.u_scale, []
         policy = ca.Function("policy", [x, g, m], [ca.fmax(ca.fmin(found, 1), -1)], named)
 
-        def follow(t, x):
+        def policy_action(t, x):
             x = x if t else x @ weight[1 : S + 1].T  # scenarios share the first action: that of their mean
             given = ca.repmat(goal[:, t], 1, x.shape[1]), ca.repmat(mismatch, 1, x.shape[1])
             actions.append(policy.map(x.shape[1])(x, *given))
             return actions[-1]
 
-        rolled_out(step, follow)
+        rolled_out(step, policy_action)
         return [rollout, linearise, ca.Function("follow", problem, [ca.horzcat(*actions)])]
 
     def reset(self, u=None):
@@ -380,8 +381,8 @@ class ScenarioMPC(Controller):
                 found["last"] = self.plan
         if self.policy is None:
             found["middle"] = np.zeros((self.tree.inner, len(self.u_scale)))
-        for follow in self.follow:
-            found["policy"] = follow(*self.problem)[0].copy()
+        if self.follow:
+            found["policy"] = self.follow(*self.problem)[0].copy()
         return found
 
     def _cost(self, u):
@@ -409,14 +410,14 @@ class ScenarioMPC(Controller):
                 break
             slack = np.vdot(price[:, 0], np.maximum(low, 0)) + np.vdot(price[:, 1], np.maximum(-high, 0))
             self.stats["predicted"] = predicted = slack - found
-            worth, before = STATIONARY * abs(cost), cost
-            for share in SHARES if predicted > worth else SHARES[:1]:
+            tolerance, before = STATIONARY * abs(cost), cost
+            for share in SHARES if predicted > tolerance else SHARES[:1]:
                 new = np.clip(u + share * step, -1, 1)
                 new_cost = self._cost(new)
                 if new_cost < before and not before - new_cost < 0.1 * share * predicted:
                     u, cost = new, new_cost
                     break
-            as_predicted = abs(before - cost - predicted) <= worth
+            as_predicted = abs(before - cost - predicted) <= tolerance
             if as_predicted or cost == before:
                 self.stats["stop"] = "stationary" if as_predicted else "stalled"
                 break
@@ -593,6 +594,7 @@ def check(args):
 
 def main(args):
     plant, goal, critic = check(args)
+    args = replace(args, critic=critic_path(args))  # the latest one may change
     names = list(dict.fromkeys(args.controllers))
     if len(envs.scenario_set(plant, "mpc")) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):
         names.remove("robust_mpc")

@@ -157,6 +157,7 @@ class Actor(nn.Module):
         self.head = nn.Linear(widths[-1], 2 * n_u)  # mean and log standard deviation before tanh
 
     def forward(self, z):
+        """Mean and log standard deviation before they are squashed, (B, n_u) each."""
         for layer in self.layers:
             z = F.silu(layer(z))
         return self.head(z).chunk(2, dim=-1)
@@ -217,7 +218,7 @@ class HERBuffer:
 
     def __init__(self, args, plant):
         self.rows, self.num_envs = args.buffer_size // args.num_envs, args.num_envs
-        self.branches = args.branches if args.branches > 1 else 0
+        self.branches = args.branches if args.branches > 1 else 0  # one is the transition's own next state
         self.strategy, self.ratio, self.goal_index = args.her_strategy, args.her_ratio, plant.GOAL_INDEX
         n_x, n_u, shape = len(plant.X_LOW), len(plant.U_LOW), (self.rows, self.num_envs)
         self.x, self.x_next = torch.zeros(2, *shape, n_x)
@@ -294,11 +295,11 @@ class SAC(Policy):
         return self.physical(self.actor.sample(self.features(x, goal), self.generator)[0])
 
     def reward(self, x, goal, xp):
-        """Of states reached (B, n_x) under goals (B, n_goal), (B,), in numpy or torch."""
+        """Of states reached (B, n_x) under goals (B, n_goal), (B,), in numpy or torch: eq:goalreward."""
         a, achieved = self.args, x[:, self.plant.GOAL_INDEX]
         how = a.smooth_reward, a.reward_sigma2, a.reward_tolerance
         reward = envs.goal_reward(self.plant, achieved, goal, *how, xp=xp)
-        if a.constraint_weight:  # or a planner puts a violation off to after its horizon, where it is free
+        if a.constraint_weight:  # else a planner puts a violation off to after its horizon, where it is free
             reward = reward + a.constraint_weight * envs.outside_constraints(self.plant, x, xp=xp)
         return reward
 
@@ -316,7 +317,7 @@ class SAC(Policy):
         return y.view(batch, k).mean(1)
 
     def update_critic(self, x, u, goal, x_next):
-        """One step of both critics; returns what to log."""
+        """One step of both critics (eq:updateQ), on what `HERBuffer.sample` returns; returns what to log."""
         with torch.no_grad():
             y = self.targets(goal, x_next)
         q = self.critic(self.features(x, goal), (u - self.scaling.u_center) / self.scaling.u_scale)
@@ -330,7 +331,7 @@ class SAC(Policy):
         return {"losses/qf_loss": loss.detach(), "losses/qf_values": q.detach().mean()}
 
     def update_actor(self, x, goal):
-        """One step of the actor and the entropy coefficient; returns what to log."""
+        """One step of the actor (eq:dpgalg) and the entropy coefficient; returns what to log."""
         z = self.features(x, goal)
         action, log_prob = self.actor.sample(z, self.generator)
         alpha = self.log_alpha.detach().exp()
@@ -427,10 +428,9 @@ def main(args, kind=SAC):
     writer.add_text("hyperparameters", "\n".join(["|argument|value|", "|-|-|", *lines]))
 
     torch.set_num_threads(1)  # networks this small run fastest on one
-    options = args.scenarios, args.smooth_reward, args.reward_sigma2, args.reward_tolerance
     agent, buffer = kind(args, plant), HERBuffer(args, plant)
-    options += (buffer.branches, args.scenario_hold)
-    vec = envs.VectorGoalEnv(args.env, args.num_envs, *options, **args.plant_options)
+    options = dict(scenarios=args.scenarios, branches=buffer.branches, scenario_hold=args.scenario_hold)
+    vec = envs.VectorGoalEnv(args.env, args.num_envs, **options, **args.plant_options)
     rng = np.random.default_rng([args.seed, 2])  # random actions before learning starts
     obs, _ = vec.reset(seed=args.seed)
     if plant_data:
@@ -463,7 +463,7 @@ def main(args, kind=SAC):
                 action = rng.uniform(plant.U_LOW, plant.U_HIGH, size=(args.num_envs, len(plant.U_LOW)))
             else:
                 action = agent.explore(obs["observation"], obs["desired_goal"])
-            next_obs, _, _, done, infos = vec.step(action)
+            next_obs, _, _, done, infos = vec.step(action)  # `SAC.reward` counts constraints, too
             # same-step autoreset: where an episode ended, the state that it reached is in final_obs
             reached = infos.get("final_obs", next_obs)["observation"]
             goal = obs["desired_goal"]

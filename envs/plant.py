@@ -63,6 +63,7 @@ class Plant:
             raise ValueError(f"envs/{name}.py lacks {', '.join(missing)}")
         _check(source, name)
         self.defaults = _defaults(source)
+        self.BENCHMARK = self.defaults["BENCHMARK"] | getattr(source, "BENCHMARK", {})  # may name some of it
         _check(self, name)
         _try_a_step(self)
 
@@ -222,6 +223,9 @@ def _check(p, name):
         low, high = (np.asarray(getattr(p, f"{box}_{end}", 0.0), dtype=float) for end in ("LOW", "HIGH"))
         if (low > high).any() or box == "U" and (low == high).any():
             refuse(f"{box}_LOW is {low.tolist()}, {box}_HIGH {high.tolist()}; they are not in order")
+    unknown = set(getattr(p, "BENCHMARK", {})) - {"horizon", "slack_price", "change_weight"}
+    if unknown:
+        refuse(f"BENCHMARK has {', '.join(sorted(unknown))}; it takes horizon, slack_price and change_weight")
     for each in ("nominal", "mpc", "robust"):
         if each not in getattr(p, "SCENARIOS", [each]):
             refuse(f"SCENARIOS lacks {each!r}")
@@ -244,11 +248,12 @@ def _try_a_step(p):
             )
 
 
-def reachable_goals(plant, actions=1600, steps=500):
+def reachable_goals(plant, actions=1600, steps=2000):
     """Lowest and highest goal that every scenario of the set "mpc" holds at steady state within the constraints, (1,) each.
 
     To be written down as GOAL_REACHABLE of a plant with one goal, no angle, that comes to rest by itself: about so many constant actions, a
-    grid or random ones, are held for so many steps from START. Raises ValueError for another plant, or where nothing is held.
+    grid or random ones, are held from START until nothing moves, or for so many steps: a slow plant may need more. Raises ValueError for
+    another plant, or where nothing is held.
     """
     if len(plant.GOAL_INDEX) != 1 or plant.GOAL_INDEX[0] in plant.ANGLES:
         raise ValueError("reachable_goals needs a plant with one goal, which is no angle")
@@ -260,7 +265,9 @@ def reachable_goals(plant, actions=1600, steps=500):
         x, psi = np.tile(np.asarray(plant.START, dtype=float), (len(u), 1)), np.tile(psi, (len(u), 1))
         for _ in range(steps):
             x, before = plant.step(x, u, psi), x
-        rests = (np.abs(x - before) < 1e-6 * half_width(plant)).all(axis=1)
+            rests = (np.abs(x - before) < 1e-6 * half_width(plant)).all(axis=1)
+            if rests.all():
+                break
         goals = x[rests & ((plant.X_LOW <= x) & (x <= plant.X_HIGH)).all(axis=1), plant.GOAL_INDEX[0]]
         ends.append((goals.min(initial=np.inf), goals.max(initial=-np.inf)))
     low, high = np.max(ends, axis=0)[:1], np.min(ends, axis=0)[1:]

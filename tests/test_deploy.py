@@ -1378,3 +1378,9 @@ def test_help_documents_every_argument():
     documented = Path(deploy.__file__).read_text().split("class Args:")[1].split("# The learned value")[0]
     for field in fields(deploy.Args):  # a sentence below each
         assert documented.split(f"\n    {field.name}: ")[1].splitlines()[1].startswith('    """'), field.name
+
+
+def test_a_finite_price_is_the_price():
+    """Above that of hard bounds, too."""
+    dear = mpc(2, slack_price=5000.0, goal=np.array([0.65]))
+    np.testing.assert_allclose(dear.slack_price, 5000.0 * np.tile(dear.x_scale, (2, 1)))

@@ -148,7 +148,7 @@ def test_the_terminal_value_takes_the_mismatch_at_every_leaf(observing):
     plan = np.random.default_rng(0).uniform(-0.5, 0.5, size=(mpc.tree.inner, 2))
     for difference in (0 * cstr.MISMATCH_SCALE, cstr.MISMATCH_SCALE):
         mpc.reset()
-        mpc.policy, mpc.follow = None, []
+        mpc.policy, mpc.follow = None, None
         mpc.estimator.difference, mpc.plan, mpc.x_before = difference, plan, cstr.START
         mpc.make_step(NEAR)
         costs.append(mpc.stats["cost"])

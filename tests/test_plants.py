@@ -235,6 +235,21 @@ def test_what_estimators_are_given_is_copied():
     np.testing.assert_array_equal(*found)
 
 
+def test_a_benchmark_names_what_it_changes(folder):
+    """The rest keeps its default, in training and in planners alike."""
+    horizon = envs.load(folder("horizon", text=SMALLEST + 'BENCHMARK = {"horizon": 3}\n')).BENCHMARK
+    assert horizon["horizon"] == 3 and np.isinf(horizon["slack_price"]).all()
+    with pytest.raises(ValueError, match="BENCHMARK has prices"):
+        envs.load(folder("price", text=SMALLEST + 'BENCHMARK = {"prices": 3}\n'))
+
+
+def test_goals_of_a_slow_plant_are_found(folder):
+    """A time constant of 300 steps: the levels that an action holds are reached late."""
+    slow = "x[1], u[0] - x[1] - x[0]", "(u[0] - x[0]) / 30, x[0] - x[1]"
+    low, high = envs.reachable_goals(envs.load(folder("slow", *slow)), actions=41, steps=6000)
+    np.testing.assert_allclose([*low, *high], [-1, 1], atol=0.01)
+
+
 def test_reachable_goals_are_held():
     plant = envs.load("cstr")
     (low,), (high,) = envs.reachable_goals(plant, actions=400, steps=300)

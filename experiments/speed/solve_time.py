@@ -95,7 +95,7 @@ def clocked(mpc):
         return "search_ms" if mpc.stats["iterations"] else "guesses_ms"
 
     mpc.rollout = Clock(mpc.rollout, spent, rolling_out)
-    mpc.follow = [Clock(follow, spent, lambda: "guesses_ms") for follow in mpc.follow]
+    mpc.follow = mpc.follow and Clock(mpc.follow, spent, lambda: "guesses_ms")
     mpc.linearise = Clock(mpc.linearise, spent, lambda: "linearise_ms")
     mpc.qp = ClockedProgram(mpc.qp, spent)
     return spent
