@@ -39,6 +39,7 @@ import envs
 from envs.agents.checkpoint import read_checkpoint
 from envs.control.compiled import OnArrays, compiled_functions
 from envs.control.controllers import ActorController, Controller, GreedyController, call, checked_problem
+from envs.control.estimation import build_estimator
 from envs.control.expansion import check_export, expansion
 from envs.control.model import prediction_model, scaling
 from envs.control.tree_qp import ScenarioTree, tree_qp
@@ -102,14 +103,16 @@ class Args:
     deadline_ms: float | None = None
     """every planner: no iteration begins later than this after its step began; default: none, since it makes
     results depend on the machine"""
+    measure: tuple[str, ...] | None = None
+    """which states are measured, by name, or "sensors": the plant's MEASURED; default: all. What is not needs an estimator"""
+    noise: float = 0.0
+    """standard deviation of the simulated sensors, a share of each state's range; the estimators know it"""
+    estimator: Literal["none", "ekf", "particles"] = "none"
+    """what tells state and plant from measurements: an extended Kalman filter, or particles"""
     offset_free: bool = False
-    """every planner: estimate from transitions how the plant differs from the model (`envs.Estimator`)"""
-    estimate: Literal["disturbance", "parameters"] = "disturbance"
-    """what --offset-free estimates: what to add to predictions, or the parameters to centre scenarios on"""
-    filter_gain: float = 1.0
-    """how far the estimate, or the mismatch that a critic observes, follows the last transition, 1: wholly"""
+    """short for --estimator ekf, which leaves no steady-state offset"""
     spread: float | None = None
-    """size of the scenario set about its centre; default: 1, the plant's, with --offset-free 0.5"""
+    """size of the scenario set about its centre; default: 1, the plant's; with an estimator what it does not know"""
     controllers: tuple[Name, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
@@ -223,7 +226,8 @@ class ScenarioMPC(Controller):
     slack_price: scalar or (2, n_x), per physical unit below X_LOW and above X_HIGH; inf: `HARD_PRICE`; 0: no bound.
     change_weight: scalar or (n_u,), price of the squared change of each action, physical units.
     policy: CasADi function like value, -> u (n_u,), or None. expansion: CasADi function (x, goal, mismatch) ->
-    value, gradient, Hessian; default: CasADi's own derivatives. estimator: an `envs.Estimator`.
+    value, gradient, Hessian; default: CasADi's own derivatives. estimator: see `Controller`; its `belief` says
+    where every scenario starts, with which parameters, and its weight.
     iterations: the most per step. deadline_ms: none begins later than this after its step began.
 
     `stats` of the last step: rung (plan, actor, hold), guess, guess_cost, cost, iterations, stop (stationary,
@@ -358,14 +362,9 @@ class ScenarioMPC(Controller):
         super().reset(u)
         self.plan = self.problem = None  # scaled actions (inner, n_u), and what they were planned from
 
-    def belief(self, x):
-        """Of every scenario the state that it starts from (S, n_x), parameters (S, n_psi), weight (S,)."""
-        S = len(self.scenarios)
-        return np.repeat([x], S, axis=0), self.scenarios + self.estimator.shift, np.full(S, 1 / S)
-
     def _problem(self, x):
         """Parameters of the compiled functions, a row per column of theirs."""
-        starts, psi, weight = self.belief(x)
+        starts, psi, weight = self.estimator.belief(self.scenarios)
         u_before = (self.u_before - self.u_center) / self.u_scale
         known = (starts - self.x_center) / self.x_scale, psi, self.tree.weights(weight)[:, None], self.goals.T
         known += self.estimator.disturbance, self.estimator.mismatch
@@ -450,23 +449,18 @@ def build_controller(name, args):
     """One of the compared controllers, a key of LABELS. Raises ValueError for what cannot work."""
     if name not in LABELS:
         raise ValueError(f"{name!r} is not a controller; choose one of {', '.join(LABELS)}")
-    plant, goal, critic = check(args)
+    plant, goal, critic, estimator = check(args)
     mu, Q, V = export(critic)
-    observed = "mismatch" if critic.mismatch_scale else None
-
-    def estimator(kind):
-        return envs.Estimator(plant, kind, args.filter_gain, critic.mismatch_scale)
-
     if name == "actor":
-        return ActorController(plant, mu, goal, estimator(observed))
+        return ActorController(plant, mu, goal, estimator)
     if name == "rl_mpc" and args.horizon == 0:
-        return GreedyController(plant, mu, Q, goal, estimator(observed))
-    spread = (0.5 if args.offset_free else 1.0) if args.spread is None else args.spread
-    scenarios = plant.PSI_NOMINAL + spread * (envs.scenario_set(plant, "mpc") - plant.PSI_NOMINAL)
+        return GreedyController(plant, mu, Q, goal, estimator)
+    scenarios = envs.scenario_set(plant, "mpc")
+    if args.spread is not None:
+        scenarios = plant.PSI_NOMINAL + args.spread * (scenarios - plant.PSI_NOMINAL)
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
     squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
-    kind = args.estimate if args.offset_free else observed
-    options = dict(goal=goal, estimator=estimator(kind), compile=args.compile)
+    options = dict(goal=goal, estimator=estimator, compile=args.compile)
     options |= dict(iterations=args.iterations, deadline_ms=args.deadline_ms)
     if name in ("nominal_mpc", "robust_mpc"):  # the plant's benchmark: its prices count once per scenario
         robust, benchmark = name == "robust_mpc", plant.BENCHMARK
@@ -516,7 +510,8 @@ def run_job(name, args, episode):
     controller, critic = worker_controller(name, args), critic_path(args)
     plant, (starts, psis) = controller.plant, draws(controller.plant, (episode or 0) + 1, args.seed)
     start, psi = (plant.START, plant.PSI_NOMINAL) if episode is None else (starts[episode], psis[episode])
-    x, u, row = run_episode(controller, plant, start, psi, controller.goal, args.steps)
+    rng = np.random.default_rng([args.seed, 7, (episode or 0) + 1])
+    x, u, row = run_episode(controller, plant, start, psi, controller.goal, args.steps, args.noise, rng)
     given = {k: v for k, v in vars(args).items() if k not in ELSEWHERE and v != getattr(Args, k)}
     goal = " ".join(f"{g:g}" for g in controller.goal)
     head = {"env": args.env, "controller": name, "horizon": controller.horizon or 0}
@@ -560,10 +555,10 @@ def table(rows):
 
 
 def check(args):
-    """Refuse, by ValueError, what cannot work before anything long starts. Returns plant, goal and critic."""
+    """Refuse, by ValueError, what cannot work before anything long starts. Returns plant, goal, critic, estimator."""
     check_ranges(args, horizon=(0, 1000), robust_horizon=(0, 10), episodes=(1, 10**6), steps=(1, 10**6))
     check_ranges(args, jobs=(1, 1024), seed=(0, 10**9), iterations=(0, 1000), deadline_ms=(1e-3, 1e6))
-    check_ranges(args, filter_gain=(1e-6, 1), sigma=(1e-6, 1e6), slack_weight=(1e-6, 1e6), spread=(0, 10))
+    check_ranges(args, noise=(0, 1), sigma=(1e-6, 1e6), slack_weight=(1e-6, 1e6), spread=(0, 10))
     path = critic_path(args)
     if args.critic is None and args.env in envs.names() and not path.exists():
         train = f"python sac_her_branching.py --env {args.env}"
@@ -575,25 +570,22 @@ def check(args):
     unused = dict.fromkeys(planning, "at --horizon 0" if args.horizon == 0 else "")
     if args.constraints == "hard":
         unused["slack_weight"] = unused["slack_weight"] or "on hard constraints"
-    if not args.offset_free:
-        unused |= {"estimate": "without --offset-free"}
-        unused |= {"filter_gain": "" if critic.mismatch_scale else "without --offset-free"}
+    unused |= {"estimator": "with --offset-free" * args.offset_free}
     check_effects(args, unused)
     if args.horizon == 0 and "goal_mpc" in args.controllers:
         raise ValueError("--horizon is 0; --controllers goal_mpc plans, so that it must be at least 1")
     if not args.controllers:
         raise ValueError(f"--controllers is empty; choose from {', '.join(LABELS)}")
     check_weights("change_weight", args.change_weight, len(plant.U_LOW))
-    uncertain = np.ptp(plant.SCENARIOS["mpc"], axis=0).any()
-    if args.offset_free and args.estimate == "parameters" and not uncertain:
-        raise ValueError(f"--estimate is parameters, but {args.env} has none that are uncertain")
     ScenarioTree(len(envs.scenario_set(plant, "mpc")), max(args.horizon, 1), args.robust_horizon)
     goal = envs.checked_goal(plant, plant.EVAL_GOAL if args.goal is None else args.goal)
-    return plant, goal, critic
+    kind, certain = "ekf" if args.offset_free else args.estimator, args.spread is not None
+    options = dict(certain=certain, mismatch_scale=critic.mismatch_scale, compile=args.compile)
+    return plant, goal, critic, build_estimator(plant, kind, args.measure, args.noise, **options)
 
 
 def main(args):
-    plant, goal, critic = check(args)
+    plant, goal, critic, _ = check(args)
     args = replace(args, critic=critic_path(args))  # the latest one may change
     names = list(dict.fromkeys(args.controllers))
     if len(envs.scenario_set(plant, "mpc")) == 1 and {"nominal_mpc", "robust_mpc"} <= set(names):

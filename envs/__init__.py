@@ -17,6 +17,7 @@ It may name, in place of the default in brackets:
     EPISODE_STEPS, TIME_UNIT    steps before truncation (50), unit of DT ("s")
     INIT_LOW, INIT_HIGH         box of initial states, finite; it also scales states (X_LOW, X_HIGH)
     OBS_LOW, OBS_HIGH           box that every reachable state stays in (infinite)
+    MEASURED                    names of the states that have sensors (all)
     ANGLES                      indices of states that are angles: networks see sine and cosine (none)
     START, START_NOISE          a start state, and how far a seed moves it (the box's middle, a twentieth of its width)
     PSI_NAMES, SCENARIOS,       sets to draw psi from: "nominal", "mpc" (planners branch over it), "robust" (training);
@@ -41,7 +42,7 @@ It may name, in place of the default in brackets:
 
 A family of plants (`envs/linear.py`) defines `make(dim, system)`, which returns an object with these names; one with a
 linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline. `plant.py` holds defaults, checks and
-measures, `goal_env.py` the environments, `estimation.py` what transitions tell; `control/`, `agents/` and `script/` are
+measures, `goal_env.py` the environments, `mismatch.py` what agents may observe of transitions; `control/`, `agents/` and `script/` are
 what the scripts share beside plants.
 """
 
@@ -53,8 +54,8 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from envs.estimation import Estimator, Mismatch  # noqa: F401
 from envs.goal_env import GoalEnv, VectorGoalEnv  # noqa: F401
+from envs.mismatch import Mismatch  # noqa: F401
 from envs.plant import (  # noqa: F401
     Plant,
     can_hold,
@@ -69,6 +70,7 @@ from envs.plant import (  # noqa: F401
     sample_states,
     scenario_set,
     stack,
+    state_range,
     stepper,
     time_near_goal,
 )

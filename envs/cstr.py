@@ -16,6 +16,7 @@ TIME_UNIT = "h"
 
 STATE_NAMES = ("c_A", "c_B", "T_R", "T_K")
 STATE_UNITS = ("mol/l", "mol/l", "°C", "°C")
+MEASURED = ("c_B", "T_R", "T_K")
 X_LOW = np.array([0.1, 0.1, 50.0, 50.0])
 X_HIGH = np.array([2.0, 2.0, 140.0, 140.0])
 INIT_LOW, INIT_HIGH = X_LOW, X_HIGH

@@ -16,6 +16,7 @@ DT = 0.04  # s, sampling time
 TIME_UNIT = "s"
 
 STATE_NAMES = ("position", "theta_1", "theta_2", "velocity", "omega_1", "omega_2")
+MEASURED = ("position", "theta_1", "theta_2")
 STATE_UNITS = ("m", "rad", "rad", "m/s", "rad/s", "rad/s")
 X_LOW = np.array([-5.0, -np.inf, -np.inf, -np.inf, -np.inf, -np.inf])  # the track is what limits the motion
 X_HIGH = -X_LOW

@@ -5,7 +5,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.estimation import Mismatch
+from envs.mismatch import Mismatch
 from envs.plant import goal_reward, sample_states
 
 

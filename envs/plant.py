@@ -132,6 +132,7 @@ def _defaults(p):
         INIT_HIGH=init_high,
         ANGLES=[],
         MODEL_SUBSTEPS=4,
+        MEASURED=tuple(p.STATE_NAMES),
         TRAINING={},
     )
     values |= dict(OBS_LOW=np.full(len(half), -np.inf), OBS_HIGH=np.full(len(half), np.inf))
@@ -187,6 +188,8 @@ def _check(p, name):
     for names, units, n in (("STATE_NAMES", "STATE_UNITS", n_x), ("ACTION_NAMES", "ACTION_UNITS", n_u)):
         if len(getattr(p, units)) != n:
             refuse(f"{units} are {len(getattr(p, units))}, {names} {n}")
+    if not set(getattr(p, "MEASURED", ())) <= set(p.STATE_NAMES):
+        refuse(f"MEASURED is {p.MEASURED}; it must be names of states")
     for each in ("GOAL_INDEX", "ANGLES"):
         if not all(isinstance(i, (int, np.integer)) and 0 <= i < n_x for i in getattr(p, each, ())):
             refuse(f"{each} is {getattr(p, each)}; it must be indices of the {n_x} states")
@@ -283,6 +286,12 @@ def half_width(plant):
     """Half the width of the box of initial states, (n_x,), by which states are scaled; 1 where it has none."""
     half = (np.asarray(plant.INIT_HIGH) - plant.INIT_LOW) / 2
     return np.where(half > 0, half, 1.0)
+
+
+def state_range(plant):
+    """Width of the constraint box, (n_x,), of which sensor noise is a share; where it is infinite that of the box of initial states."""
+    width = np.asarray(plant.X_HIGH) - plant.X_LOW
+    return np.where(np.isfinite(width), width, 2 * half_width(plant))
 
 
 def sample_states(plant, rng, n):

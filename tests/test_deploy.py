@@ -22,6 +22,7 @@ from envs import cstr
 from envs.agents.checkpoint import read_checkpoint
 from envs.control import compiled
 from envs.control.controllers import ActorController, GreedyController
+from envs.control.estimation import KalmanFilter, Measured, ParticleFilter
 from envs.control.expansion import check_export, expansion, torch_value
 from envs.script.comparison import draws, run_episode
 
@@ -630,7 +631,7 @@ def test_a_plan_that_is_no_number_never_wins(case, pendulum_checkpoint):
             assert controller.stats["rung"] == "plan"
 
 
-@pytest.mark.parametrize("kind", [None, "disturbance", "parameters"])
+@pytest.mark.parametrize("kind", [Measured, KalmanFilter, ParticleFilter])
 def test_what_the_caller_does_with_his_buffers_afterwards_changes_nothing(kind):
     psi, spoil = np.array([1.05, 0.9]), []
     mu = ca.Function("mu", [ca.MX.sym("x", 4), ca.MX.sym("g", 1)], [ca.DM([20.0, -2000.0])])
@@ -638,8 +639,8 @@ def test_what_the_caller_does_with_his_buffers_afterwards_changes_nothing(kind):
         scenarios=cstr.SCENARIOS["mpc"].copy(), goal=np.array([0.65]), slack_price=np.full((2, 4), 2.0)
     )
     buffers |= dict(change_weight=np.zeros(2))
-    careless = mpc(2, **buffers, policy=mu, estimator=envs.Estimator(cstr, kind))
-    careful = mpc(2, goal=np.array([0.65]), slack_price=2.0, policy=mu, estimator=envs.Estimator(cstr, kind))
+    careless = mpc(2, **buffers, policy=mu, estimator=kind(cstr))
+    careful = mpc(2, goal=np.array([0.65]), slack_price=2.0, policy=mu, estimator=kind(cstr))
     for buffer in buffers.values():
         buffer[:] = 0.3
     x = X0.copy()
@@ -657,7 +658,7 @@ def test_what_the_caller_does_with_his_buffers_afterwards_changes_nothing(kind):
         spoil = [given, u, *careless.prediction()["x"], *careless.prediction()["u"]]
         for array in spoil:
             array[...] = 50.0
-        assert kind is None or t == 0 or np.abs(careful.estimator.difference).max() > 0
+        assert kind is Measured or t == 0 or np.abs(careful.estimator.shift).max() > 0
 
 
 def test_full_turns_of_an_angle_change_no_action(pendulum_checkpoint):
@@ -768,13 +769,13 @@ def test_a_goal_that_is_none_is_refused_and_leaves_the_last_one(goal):
     )
 
 
-class Believing(Shifted):
+class Believing(Measured):
     """Weights, and states to start from, that a test chooses."""
 
     given = starts = None
 
-    def belief(self, x):
-        starts, psi, weight = super().belief(x)
+    def belief(self, scenarios):
+        starts, psi, weight = super().belief(scenarios)
         return (
             starts if self.starts is None else self.starts,
             psi,
@@ -783,9 +784,9 @@ class Believing(Shifted):
 
 
 def test_weight_one_on_a_scenario_gives_that_scenarios_controller():
-    controller = mpc(2, cstr.SCENARIOS["mpc"][:4], kind=Believing)
+    controller = mpc(2, cstr.SCENARIOS["mpc"][:4], kind=Shifted, estimator=Believing(cstr))
     for i in range(4):
-        controller.given = np.eye(4)[i]
+        controller.estimator.given = np.eye(4)[i]
         nominal = mpc(2, cstr.SCENARIOS["mpc"][[i]], robust_horizon=0)
         controller.reset()
         for each in (controller, nominal):
@@ -806,14 +807,20 @@ def test_weight_one_on_a_scenario_gives_that_scenarios_controller():
 def test_weighted_costs_add_up_and_scenarios_start_from_their_own_states(robust_horizon):
     rng, psi = np.random.default_rng(2), cstr.SCENARIOS["mpc"][[0, 4, 8]]
     controller = mpc(
-        3, psi, kind=Believing, robust_horizon=robust_horizon, change_weight=[1e-4, 1e-8], iterations=0
+        3,
+        psi,
+        kind=Shifted,
+        estimator=Believing(cstr),
+        robust_horizon=robust_horizon,
+        change_weight=[1e-4, 1e-8],
+        iterations=0,
     )
-    controller.starts = X0 + rng.uniform(-1, 1, size=(3, 4)) * [0.1, 0.1, 5, 5]
+    controller.estimator.starts = X0 + rng.uniform(-1, 1, size=(3, 4)) * [0.1, 0.1, 5, 5]
     plan, u_before = rng.uniform(-1, 1, size=(controller.tree.inner, 2)), np.array([30.0, -4000.0])
 
     def cost(weight):
         controller.reset()
-        controller.given, controller.plan, controller.x_before, controller.u_before = (
+        controller.estimator.given, controller.plan, controller.x_before, controller.u_before = (
             weight,
             plan.copy(),
             cstr.START,
@@ -827,7 +834,7 @@ def test_weighted_costs_add_up_and_scenarios_start_from_their_own_states(robust_
     states, expected = written_out(
         cstr,
         controller.prediction()["u"],
-        controller.starts,
+        controller.estimator.starts,
         psi,
         np.full((1, 3), GOAL),
         numpy_stage(cstr),
@@ -845,9 +852,9 @@ def test_weighted_costs_add_up_and_scenarios_start_from_their_own_states(robust_
 
 
 def test_a_disturbance_shifts_the_prediction_by_itself_at_the_first_stage():
-    plain, shifted = (mpc(3, iterations=0, estimator=envs.Estimator(cstr, "disturbance")) for _ in range(2))
+    plain, shifted = (mpc(3, iterations=0, estimator=Measured(cstr)) for _ in range(2))
     d = np.array([0.03, -0.02, 1.5, -0.7])
-    shifted.estimator.difference = d
+    shifted.estimator.disturbance = d
     for controller in (plain, shifted):
         controller.make_step(X0)
     np.testing.assert_allclose(
@@ -871,7 +878,7 @@ def test_a_disturbance_shifts_the_prediction_by_itself_at_the_first_stage():
 def test_what_one_turn_adds_is_no_disturbance():
     psi, found = np.array([1.05, 0.95, 1.0]), []
     for turns in (0, 1):
-        estimator = envs.Estimator(double_pendulum, "disturbance")
+        estimator = KalmanFilter(double_pendulum, compile=False)
         controller = deploy.ScenarioMPC(
             double_pendulum,
             1,
@@ -895,7 +902,7 @@ def test_what_one_turn_adds_is_no_disturbance():
 def made(kind, checkpoint):
     mu, Q, _ = deploy.export(deploy.load_critic(checkpoint, "cstr", "min"))
     if kind == "mpc":
-        return mpc(2, policy=mu, estimator=envs.Estimator(cstr, "disturbance"))
+        return mpc(2, policy=mu, estimator=KalmanFilter(cstr, compile=False))
     return ActorController(cstr, mu, GOAL) if kind == "actor" else GreedyController(cstr, mu, Q, GOAL)
 
 
@@ -1012,7 +1019,7 @@ def test_the_constructor_refuses_what_cannot_work(wrong, words):
     [
         ("pid", {}, "pid.*rl_mpc"),
         ("rl_mpc", dict(constraints="Soft"), "--constraints.*Soft"),
-        ("rl_mpc", dict(offset_free=True, estimate="x"), "--estimate.*'x'"),
+        ("rl_mpc", dict(estimator="x"), "--estimator.*'x'"),
         ("rl_mpc", dict(combine="max"), "--combine.*max"),
         ("rl_mpc", dict(iterations=-1), "--iterations.*-1"),
         ("nominal_mpc", dict(deadline_ms=0.0), "--deadline-ms"),

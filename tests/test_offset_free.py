@@ -1,4 +1,4 @@
-"""What an agent and a controller learn about their plant from the last transitions."""
+"""What an agent that observes the mismatch learns about its plant, and the command lines of estimators."""
 
 import csv
 import json
@@ -14,6 +14,7 @@ import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
 from envs import cstr
+from envs.control.estimation import KalmanFilter, Measured, ParticleFilter
 from envs.control.expansion import check_export
 from envs.script.comparison import run_episode
 
@@ -81,35 +82,30 @@ def test_without_the_flags_nothing_changes():
     last = [vec.step(np.full((3, 2), [20.0, -1000.0]))[0]["observation"] for _ in range(55)][-1]
     np.testing.assert_allclose(last.sum(axis=0), PINNED, rtol=1e-10)
     plain = deploy.build_controller("rl_mpc", deploy.Args(horizon=1, compile=False))
-    free = deploy.build_controller(
-        "rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True, spread=1.0, filter_gain=0.3)
-    )
-    assert plain.estimator.kind is None and free.estimator.kind == "disturbance"
-    assert (plain.scenarios == cstr.SCENARIOS["mpc"]).all() and (
-        free.scenarios == cstr.SCENARIOS["mpc"]
-    ).all()
-    # with nothing estimated yet the first step is the same, and the second one is not
-    np.testing.assert_array_equal(plain.make_step(NEAR), free.make_step(NEAR))
-    assert plain.stats["cost"] == free.stats["cost"]
-    for controller in (plain, free):
-        controller.make_step(cstr.step(NEAR, [20.0, -1000.0], np.array([1.05, 0.9])))
-    assert abs(plain.stats["cost"] - free.stats["cost"]) > 1e-3
+    assert type(plain.estimator) is Measured and (plain.scenarios == cstr.SCENARIOS["mpc"]).all()
 
 
 def test_the_arguments_reach_the_controllers(observing):
-    for name in ("nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"):
-        controller = deploy.build_controller(
-            name, deploy.Args(horizon=1, compile=False, offset_free=True, filter_gain=0.3)
-        )
-        assert (controller.estimator.kind, controller.estimator.gain) == ("disturbance", 0.3)
-        if name != "nominal_mpc":
-            half = cstr.PSI_NOMINAL + 0.5 * (cstr.SCENARIOS["mpc"] - cstr.PSI_NOMINAL)
-            np.testing.assert_array_equal(controller.scenarios, half)
+    given = dict(horizon=1, compile=False, measure=("c_B", "T_K"), noise=0.02)
+    for kind, options in (
+        (KalmanFilter, dict(offset_free=True)),
+        (ParticleFilter, dict(estimator="particles")),
+    ):
+        for name in ("actor", "nominal_mpc", "goal_mpc", "rl_mpc"):
+            estimator = deploy.build_controller(name, deploy.Args(**given, **options)).estimator
+            assert type(estimator) is kind and estimator.measured.tolist() == [1, 3] and not estimator.certain
+            np.testing.assert_allclose(np.sqrt(estimator.variance) * estimator.x_scale[[1, 3]], [0.038, 1.8])
+    mpc = deploy.build_controller(
+        "rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True, spread=0.5)
+    )
+    half = cstr.PSI_NOMINAL + 0.5 * (cstr.SCENARIOS["mpc"] - cstr.PSI_NOMINAL)
+    np.testing.assert_array_equal(mpc.scenarios, half)
+    assert mpc.estimator.certain
     for name, horizon in (("actor", 1), ("rl_mpc", 0), ("rl_mpc", 1)):
-        controller = deploy.build_controller(
-            name, deploy.Args(horizon=horizon, compile=False, critic=observing, filter_gain=0.3)
-        )
-        assert (controller.estimator.kind, controller.estimator.gain) == ("mismatch", 0.3)
+        args = deploy.Args(horizon=horizon, compile=False, critic=observing)
+        assert deploy.build_controller(name, args).estimator.mismatch_scale is not None
+    sensors = deploy.Args(measure=("sensors",), offset_free=True, compile=False)
+    assert deploy.check(sensors)[3].measured.tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -130,9 +126,9 @@ def test_actions_depend_on_the_mismatch_that_the_critic_observes(name, horizon):
         deploy.build_controller(name, deploy.Args(horizon=horizon, compile=False, critic=critic)),
         [],
     )
-    for difference in (0 * cstr.MISMATCH_SCALE, cstr.MISMATCH_SCALE):
-        controller.estimator.difference = difference
-        controller.estimator.before = None
+    for mismatch in (np.zeros(4), np.full(4, np.tanh(1.0))):
+        controller.reset()
+        controller.estimator.mismatch = mismatch
         actions.append(controller.make_step(NEAR))
     assert np.abs(actions[1] - actions[0]).max() > 1e-3
 
@@ -146,10 +142,10 @@ def test_the_terminal_value_takes_the_mismatch_at_every_leaf(observing):
     )
     V = deploy.export(deploy.load_critic(observing, "cstr"))[2]
     plan = np.random.default_rng(0).uniform(-0.5, 0.5, size=(mpc.tree.inner, 2))
-    for difference in (0 * cstr.MISMATCH_SCALE, cstr.MISMATCH_SCALE):
+    for mismatch in (np.zeros(4), np.full(4, np.tanh(1.0))):
         mpc.reset()
         mpc.policy, mpc.follow = None, None
-        mpc.estimator.difference, mpc.plan, mpc.x_before = difference, plan, cstr.START
+        mpc.estimator.mismatch, mpc.plan, mpc.x_before = mismatch, plan, cstr.START
         mpc.make_step(NEAR)
         costs.append(mpc.stats["cost"])
     m, leaves = np.full(4, np.tanh(1.0)), mpc.prediction()["x"][-1].T
@@ -157,22 +153,6 @@ def test_the_terminal_value_takes_the_mismatch_at_every_leaf(observing):
     assert (
         len(leaves) == 9 and costs[1] - costs[0] == pytest.approx(expected, abs=1e-9) and abs(expected) > 1e-3
     )
-
-
-def test_a_disturbance_moves_the_first_prediction_by_itself_and_shifted_parameters_are_predicted_with():
-    for estimate in ("disturbance", "parameters"):
-        args = deploy.Args(horizon=2, compile=False, offset_free=True, estimate=estimate, iterations=0)
-        mpc, psi, x = deploy.build_controller("rl_mpc", args), np.array([1.04, 0.93]), NEAR
-        for _ in range(3):
-            x = cstr.step(x, mpc.make_step(x), psi)
-        mpc.make_step(x)
-        u, known = mpc.prediction()["u"][0][:, 0], mpc.estimator
-        for predicted, scenario in zip(mpc.prediction()["x"][0].T, mpc.scenarios):
-            expected = cstr.step(x, u, scenario + known.shift, substeps=4) + known.disturbance
-            np.testing.assert_allclose(predicted, expected, rtol=1e-9)
-        assert known.disturbance.any() == (estimate == "disturbance") and known.shift.any() == (
-            estimate == "parameters"
-        )
 
 
 def test_resuming_a_run_with_held_scenarios_keeps_them(tmp_path):
@@ -217,82 +197,20 @@ def test_the_deployed_actor_sees_what_the_trained_one_saw(observing):
         x = policy.plant.step(x, np.clip(action, cstr.U_LOW, cstr.U_HIGH), psi[None])
 
 
-# Estimates
-
-
-@pytest.mark.parametrize("psi", [(1.0, 1.0), (1.05, 0.9), (0.96, 1.07), (1.08, 0.85)])
-def test_estimated_parameters_are_the_true_ones_without_noise(psi):
-    estimator, x, rng = envs.Estimator(cstr, "parameters"), NEAR, np.random.default_rng(0)
-    for _ in range(4):
-        u = rng.uniform(cstr.U_LOW, cstr.U_HIGH)
-        estimator.before, x = (x, u), cstr.step(x, u, np.array(psi))
-        estimator.update(x)
-    np.testing.assert_allclose(cstr.PSI_NOMINAL + estimator.shift, psi, atol=1e-4)
-    estimator.reset()
-    assert (estimator.shift == 0).all() and (estimator.mismatch == 0).all()
-
-
-def test_the_disturbance_makes_the_nominal_model_right_and_the_gain_filters_it():
-    psi, u, x = np.array([1.05, 0.9]), np.array([20.0, -2000.0]), NEAR
-    estimators = [envs.Estimator(cstr, "disturbance", gain) for gain in (1.0, 0.25)]
-    x_next = cstr.step(x, u, psi)
-    for estimator in estimators:
-        estimator.before = x, u
-        estimator.update(x_next)
-    np.testing.assert_allclose(
-        cstr.step(x, u, cstr.PSI_NOMINAL) + estimators[0].disturbance, x_next, rtol=1e-12
-    )
-    np.testing.assert_allclose(estimators[1].disturbance, estimators[0].disturbance / 4)
-    np.testing.assert_allclose(estimators[1].mismatch, estimators[0].mismatch / 4)
-
-
-@pytest.mark.parametrize("kind", ["disturbance", "parameters"])
-def test_a_wrong_measurement_teaches_nothing(kind):
-    """Neither on its arrival nor as the state that the next transition starts from."""
-    psi, u, x, estimator = np.array([1.05, 0.9]), np.array([20.0, -2000.0]), NEAR, envs.Estimator(cstr, kind)
-    known = []
-    for wrong in (None, None, [1e6, 0.5, -1e9, 130.0], None):
-        seen = x if wrong is None else np.array(wrong)
-        estimator.update(seen)
-        known.append([*estimator.difference, *estimator.shift])
-        estimator.before, x = (seen, u), cstr.step(x, u, psi)
-    assert not np.any(known[0]) and np.any(known[1])
-    np.testing.assert_array_equal(known[1:], [known[1]] * 3)
-
-
-@pytest.mark.parametrize(
-    "name, estimate",
-    [("nominal_mpc", "parameters"), ("nominal_mpc", "disturbance"), ("rl_mpc", "disturbance")],
-)
-def test_no_offset_remains(name, estimate):
-    """Near the goal, on a plant that the nominal model misses."""
-    offsets = []
-    for offset_free in (False, True):
-        args = deploy.Args(
-            horizon=5,
-            compile=False,
-            offset_free=offset_free,
-            estimate=estimate if offset_free else "disturbance",
-        )
-        x, _, _ = closed_loop(deploy.build_controller(name, args), (1.04, 0.93), 40)
-        offsets.append(abs(x[-5:, 1] / cstr.EVAL_GOAL[0] - 1).mean())
-    assert offsets[1] < (0.001 if name == "nominal_mpc" else 0.004) < 0.005 < offsets[0]
-
-
 # Command line
 
 
 def test_command_lines(observing, tmp_path):
     keep = dict(critic=observing, episodes=1, steps=3, jobs=1, compile=False, out=tmp_path)
     for controllers, given in (
-        (("actor", "goal_mpc", "rl_mpc"), dict(horizon=1, offset_free=True)),
+        (("actor", "goal_mpc", "rl_mpc"), dict(horizon=1, offset_free=True, noise=0.01)),
         (("rl_mpc",), dict(horizon=0)),
     ):
         deploy.main(deploy.Args(controllers=controllers, **given, **keep))
         rows = list(csv.DictReader(open(tmp_path / "results.csv")))
         assert tuple(row["controller"] for row in rows) == controllers and rows[0]["fell_back"] == "0"
         assert json.loads(rows[0]["arguments"]) == {"steps": 3} | (
-            {"offset_free": True} if "offset_free" in given else {}
+            {"offset_free": True, "noise": 0.01} if "offset_free" in given else {}
         )
 
 
@@ -315,19 +233,23 @@ def test_command_lines(observing, tmp_path):
             ["--observe-mismatch", "--add-plant-data", "x.npz"],
             ["--add-plant-data", "--observe-mismatch"],
         ),
-        ("rl_mpc_deploy.py", ["--offset-free", "--filter-gain", "0"], ["--filter-gain", "0.0"]),
-        ("rl_mpc_deploy.py", ["--estimate", "parameters"], ["--estimate", "no effect", "--offset-free"]),
-        ("rl_mpc_deploy.py", ["--filter-gain", "0.5"], ["--filter-gain", "no effect", "--offset-free"]),
         (
             "rl_mpc_deploy.py",
             ["--constraints", "hard", "--slack-weight", "3"],
             ["--slack-weight", "no effect", "hard"],
         ),
+        ("rl_mpc_deploy.py", ["--measure", "c_B", "T_R"], ["--measure", "c_A, T_K", "--estimator"]),
         (
             "rl_mpc_deploy.py",
-            ["--env", "linear", "--offset-free", "--estimate", "parameters"],
-            ["--estimate", "uncertain"],
+            ["--offset-free", "--measure", "c_X"],
+            ["measured is c_X", "c_A, c_B, T_R, T_K"],
         ),
+        ("rl_mpc_deploy.py", ["--offset-free", "--measure"], ["measured is"]),
+        ("rl_mpc_deploy.py", ["--offset-free", "--measure", "c_B", "c_B"], ["measured is c_B, c_B"]),
+        ("rl_mpc_deploy.py", ["--noise", "-0.1"], ["--noise", "-0.1"]),
+        ("rl_mpc_deploy.py", ["--noise", "nan"], ["--noise", "nan"]),
+        ("rl_mpc_deploy.py", ["--offset-free", "--estimator", "particles"], ["--estimator", "--offset-free"]),
+        ("rl_mpc_deploy.py", ["--estimator", "magic"], ["magic", "particles"]),
     ],
 )
 def test_bad_arguments_get_one_sentence(script, arguments, words, capsys):

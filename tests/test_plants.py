@@ -221,20 +221,6 @@ def test_the_batch_starts_where_it_is_told_to_as_the_single_environment_does():
             vec.reset(options=bad)
 
 
-def test_what_estimators_are_given_is_copied():
-    estimator, x, u = envs.Estimator(cstr, "parameters"), cstr.START.copy(), np.array([20.0, -2000.0])
-    found = []
-    for reuse in (False, True):
-        estimator.reset()
-        x[:] = cstr.START
-        for _ in range(4):
-            estimator.before = (x, u) if reuse else (x.copy(), u.copy())
-            x[:] = cstr.step(x, u, np.array([1.03, 0.95]))  # the caller's buffer
-            estimator.update(x if reuse else x.copy())
-        found.append(estimator.shift)
-    np.testing.assert_array_equal(*found)
-
-
 def test_a_benchmark_names_what_it_changes(folder):
     """The rest keeps its default, in training and in planners alike."""
     horizon = envs.load(folder("horizon", text=SMALLEST + 'BENCHMARK = {"horizon": 3}\n')).BENCHMARK

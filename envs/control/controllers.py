@@ -7,6 +7,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import envs
+from envs.control.estimation import Measured
 
 
 def call(function, *arguments):
@@ -42,16 +43,20 @@ def checked_problem(plant, scenarios, slack_price, change_weight):
 
 
 class Controller:
-    """What every controller does around its action: `u = make_step(x0)`, `set_goal(goal)`, `reset()`, `stats`.
+    """What every controller does around its action: `u = make_step(y)`, `set_goal(goal)`, `reset()`, `stats`.
 
     A subclass defines `action(x, tick)`: the action (n_u,) for the state x (n_x,), physical units, of a step that
-    began at tick. Where that is not finite the last action is applied again.
+    began at tick. Where that is not finite the last action is applied again. estimator: an `envs.control.estimation.Measured`,
+    which makes x of the measurement y; default: y is the state.
     """
 
     horizon = None
 
     def __init__(self, plant, goal, estimator=None):
-        self.plant, self.estimator = plant, estimator or envs.Estimator(plant)
+        self.plant, self.estimator = plant, estimator or Measured(plant)
+        self.angles = np.flatnonzero(
+            np.isin(self.estimator.measured, plant.ANGLES)
+        )  # which of what is measured
         self.set_goal(goal)
         self.reset()
 
@@ -78,24 +83,24 @@ class Controller:
         """A column per stage, (n_goal, N)."""
         return np.broadcast_to(self.goal.reshape(len(self.goal), -1), (len(self.goal), self.horizon or 1))
 
-    def make_step(self, x0):
-        """The action (n_u,), finite and within its limits, for the measured state x0 (n_x,), physical units.
+    def make_step(self, y):
+        """The action (n_u,), finite and within its limits, for the measurement y (n_y,), physical units: by default the state.
 
-        Raises ValueError for a state that is not one and stays as it was. Angles are taken to the turn nearest to the last.
+        Raises ValueError for a measurement that is none and stays as it was. Angles are taken to the turn nearest to the last.
         """
-        x, tick = envs.checked_state(self.plant, x0), time.perf_counter()
-        angles, turn = self.plant.ANGLES, 2 * np.pi
-        x[angles] = np.fmod(x[angles], turn)  # turns would take the digits of what is far away
+        y, tick = self.estimator.checked(y), time.perf_counter()
+        angles, turn = self.angles, 2 * np.pi
+        y[angles] = np.fmod(y[angles], turn)  # turns would take the digits of what is far away
         if self.x_before is not None:
-            x[angles] += turn * np.round((self.x_before - x)[angles] / turn)
-        self.estimator.update(x)
+            y[angles] += turn * np.round((self.x_before[self.estimator.measured] - y)[angles] / turn)
+        x = self.estimator.update(y, self.u_before)
         self.stats = {"rung": "actor", "fell_back": False, "iterations": 0, "late": False}
         u = self.action(x, tick)
         if not np.isfinite(u).all():
             self.stats |= {"rung": "hold", "fell_back": True}
             u = self.u_before
         self.x_before, self.u_before = x, np.clip(u, self.plant.U_LOW, self.plant.U_HIGH)
-        self.estimator.before = self.x_before, self.u_before
+        self.stats |= self.estimator.report
         self.stats["wall_ms"] = 1e3 * (time.perf_counter() - tick)
         return self.u_before.copy()
 

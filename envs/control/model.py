@@ -15,8 +15,11 @@ def scaling(plant):
     )
 
 
-def prediction_model(plant):
-    """CasADi functions (x, u, psi) -> x one sampling time later, and -> x with its Jacobians A and B; x and u scaled, psi as it is."""
+def prediction_model(plant, second="u"):
+    """CasADi functions (x, u, psi) -> x one sampling time later, and -> that with its Jacobians by x and by `second`, u or psi.
+
+    x and u are scaled, psi is as it is.
+    """
     x_center, x_scale, u_center, u_scale = scaling(plant)
     sizes, discrete = (len(x_scale), len(u_scale), len(plant.PSI_NOMINAL)), hasattr(plant, "next_state")
     x, u, psi = ((ca.MX if discrete else ca.SX).sym(name, n) for name, n in zip(("x", "u", "psi"), sizes))
@@ -29,10 +32,11 @@ def prediction_model(plant):
     # one substep is the unit that is differentiated and compiled: unrolled, several take several times as long to compile
     named = {"never_inline": True}
     substep = ca.Function("substep", [x, u, psi], [after], named)
-    jacobians = [ca.densify(ca.jacobian(after, v)) for v in (x, u)]
+    by = {"u": u, "psi": psi}[second]
+    jacobians = [ca.densify(ca.jacobian(after, v)) for v in (x, by)]
     sensitive = ca.Function("substep_jacobian", [x, u, psi], [after, *jacobians], named)
     x, u, psi = (ca.MX.sym(name, n) for name, n in zip(("x", "u", "psi"), sizes))
-    plain, after, A, B = x, x, ca.MX.eye(sizes[0]), ca.MX.zeros(sizes[0], sizes[1])
+    plain, after, A, B = x, x, ca.MX.eye(sizes[0]), ca.MX.zeros(sizes[0], by.numel())
     for _ in range(plant.MODEL_SUBSTEPS):
         plain = substep(plain, u, psi)
         after, a, b = sensitive(after, u, psi)

@@ -22,12 +22,16 @@ def draws(plant, episodes, seed):
     return starts, np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
 
 
-def run_episode(controller, plant, x0, psi, goal, steps):
-    """Closed loop on a plant with fixed parameters: x (steps + 1, n_x), u (steps, n_u) and the row of results.csv."""
+def run_episode(controller, plant, x0, psi, goal, steps, noise=0.0, rng=None):
+    """Closed loop on a plant with fixed parameters: x (steps + 1, n_x), u (steps, n_u) and the row of results.csv.
+
+    What the controller's estimator measures is disturbed by `noise`, a standard deviation, share of each state's range, drawn from rng.
+    """
     controller.reset()
-    x, u, log = [np.array(x0, dtype=float)], [], []
+    x, u, log, deviation = [np.array(x0, dtype=float)], [], [], noise * envs.state_range(plant)
     for _ in range(steps):
-        u.append(controller.make_step(x[-1]))
+        y = x[-1] + deviation * rng.normal(size=len(deviation)) if noise else x[-1]
+        u.append(controller.make_step(y[controller.estimator.measured]))
         x.append(plant.step(x[-1], u[-1], psi))
         log.append(controller.stats)
     x, u = np.array(x), np.array(u)

@@ -222,7 +222,7 @@ def build_controller(name, args, kind=IpoptMPC, replaced=()):
 
     kind: the class of RL+MPC; replaced: see `benchmark`.
     """
-    plant, goal, critic = deploy.check(args)
+    plant, goal, critic, _ = deploy.check(args)
     scenarios, options = plant.SCENARIOS["mpc"], dict(goal=goal, compile=args.compile)
     if name in ("nominal_mpc", "robust_mpc"):
         horizon, problem = benchmark(plant, name, scenarios, replaced)

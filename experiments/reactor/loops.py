@@ -87,7 +87,7 @@ KINDS = {"ipopt": literal.IpoptMPC, "literal": literal.LiteralMPC, "printed": li
 
 def value_mpc(settings, kind=deploy.ScenarioMPC, scenarios=None):
     """RL+MPC as by deploy.build_controller, of another class or with another scenario set (S, n_psi)."""
-    plant, goal, critic = deploy.check(settings)
+    plant, goal, critic, _ = deploy.check(settings)
     mu, _, V = deploy.export(critic)
     price = critic.slack_weight if settings.slack_weight is None else settings.slack_weight
     options = dict(slack_price=price, iterations=settings.iterations, compile=settings.compile)
@@ -98,13 +98,10 @@ def value_mpc(settings, kind=deploy.ScenarioMPC, scenarios=None):
 
 def benchmark_mpc(name, settings, replaced):
     """nominal_mpc or robust_mpc as by deploy.build_controller, with items in place of those of the plant's BENCHMARK."""
-    plant, goal, _ = deploy.check(settings)
-    spread = (0.5 if settings.offset_free else 1.0) if settings.spread is None else settings.spread
-    scenarios = plant.PSI_NOMINAL + spread * (envs.scenario_set(plant, "mpc") - plant.PSI_NOMINAL)
+    plant, goal, _, estimator = deploy.check(settings)
+    scenarios = envs.scenario_set(plant, "mpc")
     horizon, options = literal.benchmark(plant, name, scenarios, replaced)
-    estimated = settings.estimate if settings.offset_free else None
-    options |= dict(goal=goal, estimator=envs.Estimator(plant, estimated, settings.filter_gain))
-    options |= dict(iterations=settings.iterations, compile=settings.compile)
+    options |= dict(goal=goal, estimator=estimator, iterations=settings.iterations, compile=settings.compile)
     return deploy.ScenarioMPC(plant, horizon, scenarios, literal.squared_error(plant), **options)
 
 
@@ -128,7 +125,7 @@ class Recorder:
     """A controller that keeps the statistics of its steps."""
 
     def __init__(self, controller):
-        self.controller, self.log = controller, []
+        self.controller, self.estimator, self.log = controller, controller.estimator, []
 
     def reset(self):
         self.controller.reset()
