@@ -110,9 +110,9 @@ class Args:
     estimator: Literal["none", "ekf", "particles"] = "none"
     """what tells state and plant from measurements: an extended Kalman filter, or particles"""
     offset_free: bool = False
-    """short for --estimator ekf, which leaves no steady-state offset"""
+    """no steady-state offset: short for --estimator ekf --spread 0.5"""
     spread: float | None = None
-    """size of the scenario set about its centre; default: 1, the plant's; with an estimator what it does not know"""
+    """size of the scenario set about its centre; default: 1, the plant's; with --estimator what it does not know"""
     controllers: tuple[Name, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True
@@ -445,6 +445,12 @@ class ScenarioMPC(Controller):
         return self.tree.by_stage(states, actions)
 
 
+def scenario_set(plant, args):
+    """The planners' scenarios (S, n_psi): the plant's, of the size that the arguments say."""
+    spread = (0.5 if args.offset_free else 1.0) if args.spread is None else args.spread
+    return plant.PSI_NOMINAL + spread * (envs.scenario_set(plant, "mpc") - plant.PSI_NOMINAL)
+
+
 def build_controller(name, args):
     """One of the compared controllers, a key of LABELS. Raises ValueError for what cannot work."""
     if name not in LABELS:
@@ -455,9 +461,7 @@ def build_controller(name, args):
         return ActorController(plant, mu, goal, estimator)
     if name == "rl_mpc" and args.horizon == 0:
         return GreedyController(plant, mu, Q, goal, estimator)
-    scenarios = envs.scenario_set(plant, "mpc")
-    if args.spread is not None:
-        scenarios = plant.PSI_NOMINAL + args.spread * (scenarios - plant.PSI_NOMINAL)
+    scenarios = scenario_set(plant, args)
     x, g = ca.MX.sym("x", len(plant.X_LOW)), ca.MX.sym("goal", len(goal))
     squared_error = ca.sumsqr(plant.goal_error(x[plant.GOAL_INDEX], g, ca))
     options = dict(goal=goal, estimator=estimator, compile=args.compile)
@@ -579,7 +583,7 @@ def check(args):
     check_weights("change_weight", args.change_weight, len(plant.U_LOW))
     ScenarioTree(len(envs.scenario_set(plant, "mpc")), max(args.horizon, 1), args.robust_horizon)
     goal = envs.checked_goal(plant, plant.EVAL_GOAL if args.goal is None else args.goal)
-    kind, certain = "ekf" if args.offset_free else args.estimator, args.spread is not None
+    kind, certain = "ekf" if args.offset_free else args.estimator, args.offset_free or args.spread is not None
     options = dict(certain=certain, mismatch_scale=critic.mismatch_scale, compile=args.compile)
     return plant, goal, critic, build_estimator(plant, kind, args.measure, args.noise, **options)
 

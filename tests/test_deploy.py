@@ -902,7 +902,7 @@ def test_what_one_turn_adds_is_no_disturbance():
 def made(kind, checkpoint):
     mu, Q, _ = deploy.export(deploy.load_critic(checkpoint, "cstr", "min"))
     if kind == "mpc":
-        return mpc(2, policy=mu, estimator=KalmanFilter(cstr, compile=False))
+        return mpc(2, policy=mu)
     return ActorController(cstr, mu, GOAL) if kind == "actor" else GreedyController(cstr, mu, Q, GOAL)
 
 
@@ -1075,7 +1075,7 @@ def test_counts_are_those_of_the_steps(checkpoint):
     controller, found = mpc(2, scenarios=cstr.PSI_NOMINAL[None]), []
 
     class Recording:
-        reset = controller.reset
+        reset, estimator = controller.reset, controller.estimator
 
         def make_step(self, x):
             controller.deadline_ms = 1e-6 if len(found) == 1 else None

@@ -271,7 +271,7 @@ def test_a_difference_that_no_parameter_explains_leaves_no_offset():
 
 def test_the_plan_starts_from_each_scenarios_own_state():
     mpc = deploy.build_controller(
-        "rl_mpc", deploy.Args(horizon=2, compile=False, offset_free=True, measure=SENSORS)
+        "rl_mpc", deploy.Args(horizon=2, compile=False, estimator="ekf", measure=SENSORS)
     )
     u = mpc.make_step([0.5, 120.0, 118.0])
     starts, psi, _ = mpc.estimator.belief(mpc.scenarios)

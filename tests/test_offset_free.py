@@ -88,16 +88,14 @@ def test_without_the_flags_nothing_changes():
 def test_the_arguments_reach_the_controllers(observing):
     given = dict(horizon=1, compile=False, measure=("c_B", "T_K"), noise=0.02)
     for kind, options in (
-        (KalmanFilter, dict(offset_free=True)),
+        (KalmanFilter, dict(estimator="ekf")),
         (ParticleFilter, dict(estimator="particles")),
     ):
         for name in ("actor", "nominal_mpc", "goal_mpc", "rl_mpc"):
             estimator = deploy.build_controller(name, deploy.Args(**given, **options)).estimator
             assert type(estimator) is kind and estimator.measured.tolist() == [1, 3] and not estimator.certain
             np.testing.assert_allclose(np.sqrt(estimator.variance) * estimator.x_scale[[1, 3]], [0.038, 1.8])
-    mpc = deploy.build_controller(
-        "rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True, spread=0.5)
-    )
+    mpc = deploy.build_controller("rl_mpc", deploy.Args(horizon=1, compile=False, offset_free=True))
     half = cstr.PSI_NOMINAL + 0.5 * (cstr.SCENARIOS["mpc"] - cstr.PSI_NOMINAL)
     np.testing.assert_array_equal(mpc.scenarios, half)
     assert mpc.estimator.certain

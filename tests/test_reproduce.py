@@ -46,7 +46,7 @@ def test_every_table_and_figure_has_a_step():
     commands = {" ".join(step.command) for step in reproduce.STEPS}
     for path in (ROOT / "experiments").glob("*/*.py"):
         text = path.read_text()
-        if "class Args" not in text:
+        if "command_line(main" not in text:
             continue
         line = next((line for line in text.splitlines() if "study: Literal[" in line), None)
         studies = json.loads(line[line.index("[") : line.index("]") + 1]) if line else [None]

@@ -14,7 +14,7 @@ WALK = 1e-2  # of how far parameters and disturbance may be off, how far they ma
 FURTHEST = 2.0  # parameters are looked for within twice their range
 SENSOR = 1e-3  # the least noise of a sensor that a filter assumes, share of the range of its state
 GATE = 25.0  # squared: a measurement five standard deviations from its prediction is wrong
-DOUBT = 0.3  # deviation of the parameters that planners allow for, however sure the filter is
+DOUBT = 0.25  # deviation of the parameters that planners allow for, however sure the filter is
 PATIENCE = 3  # steps in a row at which a measurement is wrong: then the plant has changed; if all are, the filter starts again
 
 

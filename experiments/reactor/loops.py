@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import envs
 import goal_mpc as gm
 import rl_mpc_deploy as deploy
 from envs import cstr
@@ -99,10 +98,10 @@ def value_mpc(settings, kind=deploy.ScenarioMPC, scenarios=None):
 def benchmark_mpc(name, settings, replaced):
     """nominal_mpc or robust_mpc as by deploy.build_controller, with items in place of those of the plant's BENCHMARK."""
     plant, goal, _, estimator = deploy.check(settings)
-    scenarios = envs.scenario_set(plant, "mpc")
-    horizon, options = literal.benchmark(plant, name, scenarios, replaced)
+    horizon, options = literal.benchmark(plant, name, deploy.scenario_set(plant, settings), replaced)
     options |= dict(goal=goal, estimator=estimator, iterations=settings.iterations, compile=settings.compile)
-    return deploy.ScenarioMPC(plant, horizon, scenarios, literal.squared_error(plant), **options)
+    scenarios, cost = deploy.scenario_set(plant, settings), literal.squared_error(plant)
+    return deploy.ScenarioMPC(plant, horizon, scenarios, cost, **options)
 
 
 @functools.cache
