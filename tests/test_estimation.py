@@ -7,7 +7,15 @@ from scipy.linalg import solve_discrete_are
 import envs
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.control.estimation import FURTHEST, STATE_NOISE, KalmanFilter, Measured, ParticleFilter
+from envs.control.estimation import (
+    DISTURBANCE,
+    FURTHEST,
+    STATE_NOISE,
+    WALK,
+    KalmanFilter,
+    Measured,
+    ParticleFilter,
+)
 from envs.script.comparison import draws, run_episode
 
 RANGE, SENSORS = envs.state_range(cstr), ("c_B", "T_R", "T_K")
@@ -50,7 +58,7 @@ def test_on_a_linear_plant_it_is_the_kalman_filter(linear):
     scale = estimator.x_scale
     F = np.block([[linear.A * scale / scale[:, None], pick], [np.zeros((m, n)), np.eye(m)]])
     H = np.hstack([pick.T, np.zeros((m, m))])
-    walk = np.diag(np.append(np.full(n, STATE_NOISE**2), np.full(m, (1e-2 * 5e-3) ** 2)))
+    walk = np.diag(np.append(np.full(n, STATE_NOISE**2), np.full(m, (WALK * DISTURBANCE) ** 2)))
     predicted = solve_discrete_are(F.T, H.T, walk, np.diag(estimator.variance))
     gain = predicted @ H.T @ np.linalg.inv(H @ predicted @ H.T + np.diag(estimator.variance))
     np.testing.assert_allclose(estimator.P, predicted - gain @ H @ predicted, rtol=1e-3, atol=2e-9)
@@ -338,3 +346,77 @@ def test_every_plant_has_filters():
         for _ in range(5):
             found, x = estimator.update(x, np.zeros(2)), plant.A @ x
         assert estimator.belief(plant.SCENARIOS["mpc"])[1].shape == (1, 0) and np.isfinite(found).all()
+
+
+def test_an_unstable_plant_is_followed_for_long():
+    """The pendulum held upright by feedback of the true state: rounding errors of the covariance do not grow."""
+    pendulum = envs.load("double_pendulum")
+    estimator, psi, h = KalmanFilter(pendulum, pendulum.MEASURED), pendulum.PSI_NOMINAL, 1e-6
+    rest, none = np.zeros(6), np.zeros(1)
+
+    def slope(function, n):
+        return np.stack([(function(h * e) - function(-h * e)) / (2 * h) for e in np.eye(n)], axis=-1)
+
+    A, B = slope(lambda x: pendulum.step(x, none, psi), 6), slope(lambda u: pendulum.step(rest, u, psi), 1)
+    P = solve_discrete_are(A, B, np.eye(6), np.eye(1))
+    K = np.linalg.solve(np.eye(1) + B.T @ P @ B, B.T @ P @ A)
+    x, u, rng = 0.01 * np.ones(6), none, np.random.default_rng(0)
+    for _ in range(1000):
+        found, before = estimator.update(x[estimator.measured] + 1e-6 * rng.normal(size=3), u), x
+        u = np.clip(-K @ x, pendulum.U_LOW, pendulum.U_HIGH)
+        x = pendulum.step(x, u, psi)
+        assert not estimator.report["restarted"]
+    np.testing.assert_allclose(found, before, atol=0.05)
+    assert np.linalg.eigvalsh(estimator.P)[0] > 0
+
+
+def test_parameters_stay_where_they_are_at_rest():
+    """Parameters and disturbances explain a plant at rest alike: the split between them must not wander off."""
+    estimator = KalmanFilter(cstr, noise=0.002)
+    x, u, psi, rng = cstr.START, np.array([20.0, -1500.0]), np.array([1.03, 0.95]), np.random.default_rng(0)
+    for _ in range(10_000):
+        estimator.update(x + 0.002 * RANGE * rng.normal(size=4), u)
+        x = cstr.step(x, u, psi)
+    assert (np.abs(estimator.z[4:6]) < 1.5).all()
+
+
+@pytest.mark.parametrize("kind", BOTH.values())
+def test_a_sensor_that_shows_what_cannot_be_is_left_out_for_ever(kind):
+    estimator = kind(cstr, noise=0.002)
+    for t, (x, u, y) in enumerate(simulated(estimator, (1.02, 0.97), 60, 0.002)):
+        y[1] = 1e12 + t if t >= 20 else y[1]
+        found, true = estimator.update(y, u), x
+        assert not estimator.report["restarted"]
+    assert (np.abs(found - true) < 0.03 * RANGE).all() and estimator.report["rejected"] == ("c_B",)
+
+
+@pytest.mark.parametrize("kind", BOTH.values())
+def test_a_wrong_first_reading_is_forgotten_within_ten_steps(kind):
+    estimator = kind(cstr, SENSORS, 0.005)
+    for t, (x, u, y) in enumerate(simulated(estimator, (1.0, 1.0), 25, 0.005)):
+        y[0] = 1.9 if t == 0 else y[0]
+        found, true = estimator.update(y, u), x
+        assert t < 11 or not estimator.report["rejected"]
+    assert abs(found[1] - true[1]) < 0.03 * RANGE[1]
+
+
+def test_particles_that_go_astray_are_dropped():
+    """A rate with the root of a parameter: particles with a negative one are not finite."""
+
+    class Root:
+        STATE_NAMES, ANGLES, ENV_ID = ("x",), [], "Root"
+        X_LOW = INIT_LOW = np.array([0.0])
+        X_HIGH = INIT_HIGH = np.array([2.0])
+        OBS_LOW, OBS_HIGH, U_LOW, U_HIGH = (np.array([v]) for v in (-9.0, 9.0, -1.0, 1.0))
+        PSI_NOMINAL, SCENARIOS = np.array([1.0]), {"mpc": np.array([[1.0], [0.4], [1.6]])}
+
+        def step(self, x, u, psi):
+            return x + 0.1 * (u - np.sqrt(psi) * x)
+
+    plant = Root()
+    estimator, x, u = ParticleFilter(plant, noise=0.01), np.array([1.0]), np.array([0.8])
+    rng, restarts = np.random.default_rng(0), 0
+    for _ in range(60):
+        found = estimator.update(x + 0.02 * rng.normal(size=1), u)
+        restarts, before, x = restarts + estimator.report["restarted"], x, plant.step(x, u, np.array([1.3]))
+    assert restarts == 0 and abs(found[0] - before[0]) < 0.05

@@ -236,7 +236,11 @@ def test_command_lines(observing, tmp_path):
             ["--constraints", "hard", "--slack-weight", "3"],
             ["--slack-weight", "no effect", "hard"],
         ),
-        ("rl_mpc_deploy.py", ["--measure", "c_B", "T_R"], ["--measure", "c_A, T_K", "--estimator"]),
+        (
+            "rl_mpc_deploy.py",
+            ["--measure", "c_B", "T_R"],
+            ["--measure is c_B, T_R", "--estimator", "c_A, c_B, T_R, T_K"],
+        ),
         (
             "rl_mpc_deploy.py",
             ["--offset-free", "--measure", "c_X"],

@@ -11,11 +11,13 @@ from envs.control.model import prediction_model, scaling
 STATE_NOISE = 1e-3  # what the model gets wrong in a step
 DISTURBANCE = 5e-3  # what else a step may add to the nominal model, beside what parameters explain
 WALK = 1e-2  # of how far parameters and disturbance may be off, how far they may move in a step
+RETURN = 5e-4  # share of what parameters differ from their nominal values by which they return in a step
 FURTHEST = 2.0  # parameters are looked for within twice their range
+DOUBT = 0.25  # deviation of the parameters that planners allow for, however sure the filter is
+
 SENSOR = 1e-3  # the least noise of a sensor that a filter assumes, share of the range of its state
 GATE = 25.0  # squared: a measurement five standard deviations from its prediction is wrong
-DOUBT = 0.25  # deviation of the parameters that planners allow for, however sure the filter is
-PATIENCE = 3  # steps in a row at which a measurement is wrong: then the plant has changed; if all are, the filter starts again
+PATIENCE = 3  # steps in a row at which measurements are wrong before the filter doubts itself
 
 
 class Measured:
@@ -43,7 +45,7 @@ class Measured:
 
     def update(self, y, u):
         before, self.x = self.x, self.estimate(np.array(y, dtype=float), u)
-        if self.mismatch_scale is not None and before is not None:
+        if self.mismatch_scale is not None and before is not None and not self.report.get("restarted"):
             with np.errstate(over="ignore", invalid="ignore"):
                 difference = self.x - self.plant.step(before, u, self.plant.PSI_NOMINAL)
             if (np.abs(difference) < envs.half_width(self.plant)).all():  # else a glitch, not the plant
@@ -64,22 +66,21 @@ class Filter(Measured):
 
     measured: names of states; default: all. noise: standard deviation of the sensors, a share of each state's range, a number or (n_y,).
     certain: planners take the estimate for certain, with their own scenarios about it (certainty equivalence); default: their scenarios
-    are what the filter does not know, its `points` with weights. What is not finite in a measurement is missing, and a sensor that repeats
-    itself is stuck.
+    are what the filter does not know, its `points` with weights. What is not finite in a measurement, or outside of the plant's OBS_LOW to
+    OBS_HIGH, is missing, and a sensor that repeats itself to the last digit is stuck.
 
     z begins with state and uncertain parameters, scaled. report: rejected, names of the states whose measurement was missing or wrong;
-    restarted, whether the filter started again.
+    restarted, whether the filter started again: when all have been wrong for PATIENCE steps, or one for `longest`.
     """
 
-    gives_up = staticmethod(np.all)  # of whether measurements have been wrong for long
+    longest = PATIENCE
 
     def __init__(self, plant, measured=None, noise=0.0, *, certain=False, mismatch_scale=None):
         names, noise = list(plant.STATE_NAMES), np.array(noise, dtype=float)
         chosen = names if measured is None else list(measured)
         if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(names):
-            raise ValueError(
-                f"measured is {', '.join(chosen)}; it must be different ones of {', '.join(names)}"
-            )
+            text = f"measured is {', '.join(chosen) or 'nothing'}; it must be different ones of {', '.join(names)}"
+            raise ValueError(text)
         if noise.shape not in ((), (len(chosen),)) or not ((noise >= 0) & (noise < np.inf)).all():
             raise ValueError(f"noise is {noise}; it must be a number or {len(chosen)}, finite, not negative")
         self.x_center, self.x_scale, self.u_center, self.u_scale = scaling(plant)
@@ -103,15 +104,17 @@ class Filter(Measured):
         return np.where(np.isfinite(y), y, np.nan)
 
     def estimate(self, y, u):
-        present, self.last = np.isfinite(y) & (y != self.last), y
+        low, high = (np.asarray(bound)[self.measured] for bound in (self.plant.OBS_LOW, self.plant.OBS_HIGH))
+        present, self.last = np.isfinite(y) & (low <= y) & (y <= high) & (y != self.last), y
         y = (np.where(present, y, 0.0) - self.x_center[self.measured]) / self.x_scale[self.measured]
-        y = np.clip(y, -1e6, 1e6)  # its square is finite
+        y = np.clip(y, -1e12, 1e12)  # its square is finite
         wrong, restarted, first = ~present, False, self.z is None
         if not first:
             wrong = wrong | self.step((u - self.u_center) / self.u_scale, y, present)
             self.wrong_for = np.where(present, (self.wrong_for + 1) * wrong, self.wrong_for)
-            restarted = present.any() and self.gives_up(self.wrong_for[present] >= PATIENCE)
-            restarted = bool(restarted or not np.isfinite(self.z).all())
+            late = self.wrong_for[present]
+            lost = late.min(initial=self.longest) >= PATIENCE or late.max(initial=0) >= self.longest
+            restarted = bool(present.any() and lost or not np.isfinite(self.z).all())
         if first or restarted:
             self.begin(y, present)
             wrong, self.wrong_for = ~present, 0 * present
@@ -139,10 +142,12 @@ class KalmanFilter(Filter):
     far: squared distance of each measurement from its prediction, in standard deviations.
 
     With a disturbance per measurement there is no steady-state offset (Pannocchia and Rawlings, AIChE Journal 49(2), 2003). Parameters and
-    disturbances walk at random. If a measurement is wrong for PATIENCE steps they are taken to have changed: what may be off at the start
-    is added to their covariance. `points`: the mean and, on both sides of it along the axes in which state and parameters are most
-    uncertain, sigma points, all of equal weight.
+    disturbances walk at random; at rest both explain the same, so that parameters slowly return to their nominal values (RETURN). If a
+    measurement is wrong for PATIENCE steps they are taken to have changed: what may be off at the start is added to their covariance.
+    `points`: the mean and, on both sides along the axes in which state and parameters are most uncertain, sigma points of equal weight.
     """
+
+    longest = 8
 
     def __init__(self, plant, measured=None, noise=0.0, *, compile=True, **options):
         super().__init__(plant, measured, noise, **options)
@@ -157,18 +162,18 @@ class KalmanFilter(Filter):
         whether it has been wrong before) -> z, P and the squared distance of each measurement in standard deviations."""
         n, known, m, size = self.n, self.known, len(self.measured), len(walk)
         z, P, u = ca.MX.sym("z", size), ca.MX.sym("P", size, size), ca.MX.sym("u", len(self.u_scale))
-        pick, rows, psi = (
-            np.eye(size)[:, self.measured],
-            self.uncertain.tolist(),
-            ca.MX(self.plant.PSI_NOMINAL),
-        )
+        pick, rows = np.eye(size)[:, self.measured], self.uncertain.tolist()
+        psi = ca.MX(self.plant.PSI_NOMINAL)
         psi[rows] += z[n:known] * self.half
         x, A, E = prediction_model(self.plant, "psi")[1](z[:n], u, psi)
-        F = ca.vertcat(ca.horzcat(A, E[:, rows] @ np.diag(self.half), pick[:n]), np.eye(size)[n:])
-        after = ca.vertcat(x + pick[:n] @ z[known:], z[n:]), F @ P @ F.T + walk, F @ (P + later) @ F.T + walk
-        predict = ca.Function("predict", [z, P, u], [*map(ca.densify, after)])
+        stay, given, P = np.eye(size)[n:], P, (P + P.T) / 2  # else rounding errors grow
+        stay[: known - n] *= 1 - RETURN
+        F = ca.vertcat(ca.horzcat(A, E[:, rows] @ np.diag(self.half), pick[:n]), stay)
+        z_after, P_after = ca.vertcat(x + pick[:n] @ z[known:], stay @ z), F @ P @ F.T + walk
+        after = [z_after, P_after, P_after + F @ later @ F.T]
+        predict = ca.Function("predict", [z, given, u], [*map(ca.densify, after)])
 
-        e, y, r, present = ca.MX.sym("e", size), *map(ca.MX.sym, ("y", "r", "present"))
+        P, e, y, r, present = given, ca.MX.sym("e", size), *map(ca.MX.sym, ("y", "r", "present"))
         column, innovation = P @ e, y - ca.dot(e, z)
         far = present * innovation**2 / (ca.dot(e, column) + r)
         gain = present * (far < GATE) / (ca.dot(e, column) + r)
@@ -216,8 +221,6 @@ class ParticleFilter(Filter):
     each particle with the nearest mean (Lloyd's algorithm).
     """
 
-    gives_up = staticmethod(np.any)
-
     def __init__(self, plant, measured=None, noise=0.0, *, particles=500, seed=0, **options):
         self.count, self.seed = particles, seed
         super().__init__(plant, measured, noise, **options)
@@ -245,6 +248,8 @@ class ParticleFilter(Filter):
         )
         x = self.plant.step(x * self.x_scale + self.x_center, u, self.psi(self.particles))
         x = (x - self.x_center) / self.x_scale
+        astray = ~np.isfinite(x).all(axis=1)
+        x[astray], self.weight[astray] = self.z[:n], 0.0
         innovation, variance = np.zeros((self.count, n)), np.ones(n)  # where nothing is measured
         innovation[:, self.measured] = (y - x[:, self.measured]) * present
         variance[self.measured] = STATE_NOISE**2 + self.variance
@@ -264,12 +269,14 @@ class ParticleFilter(Filter):
         return ~use[self.measured]
 
     def resample(self, kernel=0.1):
-        """Systematic; each particle then moves by a share of their spread, mean and covariance stay (Liu and West, 2001)."""
+        """Systematic; then each particle moves by a share of their spread, so that mean and covariance stay (Liu and West, 2001)."""
         at = (self.rng.uniform() + np.arange(self.count)) / self.count
         chosen = self.particles[np.searchsorted(np.cumsum(self.weight), at).clip(max=self.count - 1)]
-        spread = np.sqrt(self.weight @ (self.particles - self.z) ** 2)
+        away = (self.particles - self.z) * np.sqrt(self.weight)[:, None]
+        variance, axes = np.linalg.eigh(away.T @ away)
+        spread = axes * np.sqrt(np.maximum(variance, 0))
         self.particles = self.z + np.sqrt(1 - kernel**2) * (chosen - self.z)
-        self.particles += kernel * spread * self.rng.normal(size=chosen.shape)
+        self.particles += kernel * self.rng.normal(size=chosen.shape) @ spread.T
         self.weight = np.full(self.count, 1 / self.count)
 
     def points(self, S):
@@ -291,14 +298,17 @@ def build_estimator(plant, kind, measured=None, noise=0.0, **options):
 
     Raises ValueError for what no sensor or no estimator can tell.
     """
+    names = tuple(plant.STATE_NAMES)
     measured = plant.MEASURED if measured == ("sensors",) else measured
-    if kind != "none":
-        filters = {"ekf": KalmanFilter, "particles": ParticleFilter}
+    filters = {"ekf": KalmanFilter, "particles": ParticleFilter}
+    if kind in filters:
         own = {name: value for name, value in options.items() if name != "compile" or kind == "ekf"}
         return filters[kind](plant, measured, noise, **own)
-    hidden = [name for name in plant.STATE_NAMES if measured is not None and name not in measured]
-    if hidden:
-        raise ValueError(
-            f"--measure leaves out {', '.join(hidden)}; --estimator ekf or particles estimates that"
+    if kind != "none":
+        raise ValueError(f"--estimator is {kind!r}; choose one of none, {', '.join(filters)}")
+    if measured is not None and tuple(measured) != names:
+        text = (
+            f"--measure is {', '.join(measured)}; without --estimator ekf or particles it must be every state"
         )
+        raise ValueError(f"{text}: {', '.join(names)}")
     return Measured(plant, options.get("mismatch_scale"))

@@ -64,7 +64,7 @@ FAULTS = (
 )
 STYLES = {  # of what is drawn: colour, dashes, where its name stands in the panel of changes
     "RL+MPC": (GREY, "-", (12, -5.4)),
-    "RL+MPC, offset-free": (GREEN, "-", (12, 0.3)),
+    "RL+MPC, offset-free": (GREEN, "-", (15, 1.4)),
     "RL+MPC, Kalman filter": (BLUE, "--", None),
     "RL+MPC, particles": (ORANGE, ":", (14, -1.6)),
     "RL, offset-free": (PINK, ":", None),
@@ -271,7 +271,7 @@ def plot(rows, paths, path):
         axes[1].plot(np.median(outside), -y, "o", color=GREEN if y else "black", ms=7)
         axes[1].plot(outside.mean(), -y, "d", color=ORANGE, ms=7)
     axes[1].set_yticks(-np.arange(len(groups)), groups, fontsize=8)
-    axes[1].set(xlabel="time outside [steps]: 5th percentile to median (dot), mean (diamond)")
+    axes[1].set(xlabel="time outside [steps]\ndot: median, diamond: mean, line: to the 5th percentile")
     axes[1].set_title("$c_A$ not measured, noise 0.5 %", fontsize=11)
 
     for label, mine in grouped(paths, "controller").items():

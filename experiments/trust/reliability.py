@@ -4,8 +4,8 @@
 
 controllers: closed loops over random starts, goals and plants, and the same with a fault at every fourth step: numbers that are not
 finite in the measurement or in the previous plan, states far outside the box, a solver stopped after one iteration (goal_mpc.py: three) or
-by a deadline, goals that cannot be held. An action must be finite and within its limits, a measurement that is none must be refused, a plan
-must cost no more than its first guess, and the next step without a fault must be planned again.
+by a deadline, goals that cannot be held. An action must be finite and within its limits, a measurement that is none must be refused, or by
+a filter left out, a plan must cost no more than its first guess, and the next step without a fault must be planned again.
 training: SIGKILL at random moments, then --resume; the end must equal an uninterrupted run, bit for bit.
 checkpoints: damaged and malicious files; each must be refused in one sentence or, where the damage is not to be seen, load as finite
 numbers.
@@ -198,7 +198,8 @@ def closed_loop(cell):
                 u = controller.make_step(x)  # the true state, as the next message may bring it
                 chance()
             else:
-                counts["wrong"] += not np.isfinite(measured).all()
+                missing, left_out = not np.isfinite(measured).all(), bool(controller.stats.get("rejected"))
+                counts.update(refused=missing and left_out, wrong=missing and not left_out)
                 if faulty_before:
                     chance()
                 faulty_before = faulty
