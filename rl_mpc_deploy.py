@@ -8,9 +8,11 @@
     subject to        x_{t+1}^i = f(x_t^i, u_t^i, psi^i),  x_t^i - eps_t^i in X,  u_t^i in U,  u_0^i = u_0^j
 
 with V(x, g) = Q(x, mu(x, g), g) from a checkpoint of sac_her_branching.py, rebuilt in CasADi. The sums start at
-x_1: x_0 is measured, its reward is a constant, and V(x_N) counts rewards from x_{N+1} on. `ScenarioMPC` improves
-its plan step by step and may be stopped at any time. The controller is compared, on paired draws of start state
-and plant, with the actor alone and with nominal and robust MPC.
+x_1: what x_0 earns is a constant, and V(x_N) counts rewards from x_{N+1} on. (x_0^i, psi^i) and the weights w_i are
+the measured state with the plant's scenarios, or what an estimator does not know. A price of changes of the actions
+and an economic cost of the plant may be added. `ScenarioMPC` improves its plan step by step and may be stopped at
+any time. The controller is compared, on paired draws of start state and plant, with the actor alone and with nominal
+and robust MPC.
 
     python rl_mpc_deploy.py --horizon 5                                     # the critic that the repository ships
     python rl_mpc_deploy.py --critic experiments/pretrained/cstr_robust.pt  # the paper's, blind to constraints
@@ -85,7 +87,7 @@ class Args:
     """processes; the results do not depend on it, but for the times"""
 
     robust_horizon: int = 1
-    """RL+MPC: stages at which the scenario tree branches; 0: the nominal model alone"""
+    """RL+MPC: stages at which the scenario tree branches; 0: one model, the nominal or the estimated one"""
     sigma: float | None = None
     """RL+MPC: width of the Gaussian stage cost, units of the goal; default: the plant's
     (cstr: 0.1 as in the paper's script; its text says 0.25)"""
@@ -112,7 +114,7 @@ class Args:
     offset_free: bool = False
     """no steady-state offset: short for --estimator ekf --spread 0.5"""
     spread: float | None = None
-    """size of the scenario set about its centre; default: 1, the plant's; with --estimator what it does not know"""
+    """size of the scenario set about its centre; default: the plant's, 1; with --estimator what that does not know"""
     controllers: tuple[Name, ...] = ("actor", "nominal_mpc", "robust_mpc", "rl_mpc")
     """which controllers to compare; goal_mpc: RL+MPC's problem without the learned value"""
     compile: bool = True

@@ -86,7 +86,8 @@ class Controller:
     def make_step(self, y):
         """The action (n_u,), finite and within its limits, for the measurement y (n_y,), physical units: by default the state.
 
-        Raises ValueError for a measurement that is none and stays as it was. Angles are taken to the turn nearest to the last.
+        Raises ValueError for another shape, and without a filter for what is not finite, and stays as it was. Angles are taken to the turn
+        nearest to the last.
         """
         y, tick = self.estimator.checked(y), time.perf_counter()
         angles, turn = self.angles, 2 * np.pi
