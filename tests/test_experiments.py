@@ -31,6 +31,7 @@ EARLIER = {
 }
 TEXT = {
     "case",
+    "kind",
     "c_B",  # a path, as text
     "env",
     "variant",
