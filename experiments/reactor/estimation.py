@@ -1,6 +1,6 @@
 """From measurements, not states: filters for noise, offset and a state that nobody measures, and plans over what they do not know.
 
-    python experiments/reactor/estimation.py --jobs 2      # half an hour; continues where it stopped
+    python experiments/reactor/estimation.py --jobs 2      # ten minutes; continues where it stopped
     python experiments/reactor/estimation.py --plot-only   # redraw from the committed CSV
 
 Closed loops of rl_mpc_deploy.py on the paired draws of deploy.py: start states and plants whose parameters are fixed but unknown. Cases:
