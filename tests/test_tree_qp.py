@@ -12,7 +12,7 @@ import pytest
 
 import rl_mpc_deploy as deploy
 from envs import cstr
-from envs.control.tree_qp import ConicQP, ScenarioTree, TreeQP
+from envs.control.tree_qp import ConicQP, ScenarioTree, TreeQP, pointer
 from envs.script.comparison import draws, run_episode
 
 pytestmark = pytest.mark.skipif(
@@ -273,9 +273,8 @@ def test_problems_of_closed_loops_against_piqp(name):
 def positive_part(hessian):
     solver = shaped("no bounds")[2]
     h, result = np.ascontiguousarray(hessian, dtype=float), np.full(hessian.shape, np.nan)
-    solver.library.tree_qp_positive_part(
-        len(h), ctypes.c_void_p(h.ctypes.data), ctypes.c_void_p(result.ctypes.data)
-    )
+    work = np.empty(2 * h.size)
+    solver.library.tree_qp_positive_part(len(h), *map(pointer, (h, result, work)))
     return result
 
 

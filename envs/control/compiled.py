@@ -16,6 +16,7 @@ import numpy as np
 
 FLAGS = ("-O3", "-march=native", "-fPIC")
 WHEEL = Path(ca.__file__).parent  # CasADi's libraries, HPIPM among them, and their headers
+C_SOURCES = Path(__file__).parent / "c"  # written by hand
 
 
 def vectorised(source):

@@ -1,18 +1,16 @@
-"""A scenario tree and its quadratic program (tree_qp.c says which), by HPIPM from the CasADi wheel or by a solver of CasADi's `conic`."""
+"""A scenario tree and its quadratic program (c/tree_qp.c says which), by HPIPM from the CasADi wheel or by a solver of CasADi's `conic`."""
 
 import ctypes
 import subprocess
 import sys
-import weakref
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
-from envs.control.compiled import WHEEL, compiled
+from envs.control.compiled import C_SOURCES, WHEEL, compiled
 
 TOLERANCE, MOST_ITERATIONS = 1e-9, 60
-RIDGE = 1e-8  # on du, that of tree_qp.c
+RIDGE = 1e-8  # on du, that of c/tree_qp.c
 OUT_OF_REACH = 1e3  # half-widths of the box of initial states
 MAX_NODES = 20_000
 
@@ -88,6 +86,14 @@ def pointer(array):
     return ctypes.c_void_p(array.ctypes.data)
 
 
+class Shape(ctypes.Structure):
+    """`tree_qp_shape` of tree_qp.h."""
+
+    _fields_ = [(name, ctypes.c_int) for name in ("nodes", "inner", "nx", "nu", "rows", "changes")]
+    _fields_ += [(name, ctypes.c_void_p) for name in ("parent", "stage", "row")]
+    _fields_ += [("tolerance", ctypes.c_double), ("most", ctypes.c_int)]
+
+
 class TreeQP:
     """HPIPM's tree solver (BSD licence), one instance with memory of its own.
 
@@ -97,21 +103,24 @@ class TreeQP:
     """
 
     def __init__(self, tree, n_x, n_u, active, changes):
+        header, source = ((C_SOURCES / f"tree_qp.{kind}").read_text() for kind in "hc")
         search = [f"-L{WHEEL}", "-lhpipm", "-lblasfeo", "-lm", f"-Wl,-rpath,{WHEEL}"]
-        self.library = ctypes.CDLL(
-            str(compiled(Path(__file__).with_suffix(".c").read_text(), f"-I{WHEEL / 'include'}", link=search))
-        )
-        self.library.tree_qp_new.restype = ctypes.c_void_p
+        whole = header + source.replace('#include "tree_qp.h"', "")
+        self.library = ctypes.CDLL(str(compiled(whole, f"-I{WHEEL / 'include'}", link=search)))
+        self.library.tree_qp_size.restype = ctypes.c_size_t
+        self.library.tree_qp_init.restype = ctypes.c_void_p
         self.row = np.flatnonzero(active.any(axis=0)).astype(np.int32)
-        parent, stage = (np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage))
         self.active = active[:, self.row]
-        sizes = map(int, (len(parent), tree.inner, n_x, n_u, len(self.row), changes))
-        arrays = map(pointer, (parent, stage, self.row))
-        new = self.library.tree_qp_new(*sizes, *arrays, ctypes.c_double(TOLERANCE), MOST_ITERATIONS)
-        self.instance = ctypes.c_void_p(new)
-        self.free = weakref.finalize(self, self.library.tree_qp_free, self.instance)
+        arrays = [
+            np.ascontiguousarray(array, dtype=np.int32) for array in (tree.parent, tree.stage, self.row)
+        ]
+        sizes = map(int, (len(tree.parent), tree.inner, n_x, n_u, len(self.row), changes))
+        shape = Shape(*sizes, *map(pointer, arrays), TOLERANCE, MOST_ITERATIONS)
+        memory = np.empty(self.library.tree_qp_size(ctypes.byref(shape)), dtype=np.uint8)
+        self.instance = ctypes.c_void_p(self.library.tree_qp_init(pointer(memory), ctypes.byref(shape)))
+        self.kept = memory, arrays  # which the instance points to
         # what `solve` takes, in memory that stays where it is
-        edges, rows, inner = len(parent) - 1, len(self.row), (tree.inner, n_u)
+        edges, rows, inner = len(tree.parent) - 1, len(self.row), (tree.inner, n_u)
         shapes = [(edges, n_x * n_x), (edges, n_x * n_u), (edges, n_x), (edges, n_x * n_x), inner, inner]
         shapes += [(edges, rows), (edges, rows), (edges, 2, rows), inner, inner]
         self.given, self.du = list(map(np.zeros, shapes)), np.zeros(inner)

@@ -5,12 +5,12 @@
                             + sum over nodes with children  c_i' (moved_i + du_i - du_parent(i))^2 - c_i' moved_i^2
        subject to             dx_i = A_i dx_parent(i) + B_i du_parent(i),   dx_0 = 0, du_parent(0) = 0,   u_low_i <= du_i <= u_high_i
 
-   (H)+ is the projection of a symmetric matrix to positive semidefinite ones. Nodes are numbered so that parents come first and those
-   with children before all others. Matrices are stored column by column, everything else node by node. No globals; tree_qp_new
-   allocates, tree_qp_solve does not. Compile it without -ffast-math: not-a-number must stay what it is. */
+   (H)+ is the projection of a symmetric matrix to positive semidefinite ones. */
+
+#include "tree_qp.h"
 
 #include <math.h>
-#include <stdlib.h>
+#include <stdint.h>
 #include <string.h>
 
 #include <hpipm_d_tree_ocp_qp.h>
@@ -20,80 +20,116 @@
 #include <hpipm_tree.h>
 
 #define RIDGE 1e-8 /* on du, so that an action that no cost depends on has a solution */
+#define ALIGNMENT 64
+#define ARGUMENTS 256 /* bytes that HPIPM's arguments may take; none at present */
 
-typedef struct {
-  int nodes, inner, nx, nu, rows, changes; /* inner: with children; rows: bounded states; changes: whether c is not zero */
+struct tree_qp {
+  tree_qp_shape shape;
   struct tree tree;
   struct d_tree_ocp_qp_dim dim;
   struct d_tree_ocp_qp qp;
   struct d_tree_ocp_qp_sol sol;
   struct d_tree_ocp_qp_ipm_arg arg;
   struct d_tree_ocp_qp_ipm_ws ws;
-  int *row;
   double *scratch, *positive, *dx; /* (H)+ and dx of every edge */
-  void *memory[16];
-  int used;
-} tree_qp;
+  int *index;
+};
 
-static void *take(tree_qp *self, size_t bytes) {
-  return self->memory[self->used++] = calloc(1, bytes + 64);
-}
+static uintptr_t aligned(void *memory) { return ((uintptr_t)memory + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT; }
 
-void tree_qp_free(tree_qp *self) {
-  for (int i = 0; i < self->used; i++) free(self->memory[i]);
-  free(self);
+/* the next so many bytes; where memory begins at 0 they are only counted */
+static void *take(uintptr_t *memory, size_t bytes) {
+  const uintptr_t at = *memory;
+  *memory += (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+  return (void *)at;
 }
 
 /* size of a node's state: of nodes with children the action before belongs to it, if its change has a price */
-static int size(const tree_qp *self, int node) {
-  return node == 0 ? 0 : self->nx + (self->changes && node < self->inner ? self->nu : 0);
+static int size(const tree_qp_shape *shape, int node) {
+  return node == 0 ? 0 : shape->nx + (shape->changes && node < shape->inner ? shape->nu : 0);
 }
 
-/* parent, stage: of every node, the root's parent is -1; row: the bounded states */
-tree_qp *tree_qp_new(int nodes, int inner, int nx, int nu, int rows, int changes, const int *parent, const int *stage, const int *row,
-                     double tolerance, int most) {
-  tree_qp *self = calloc(1, sizeof *self);
-  self->nodes = nodes, self->inner = inner, self->nx = nx, self->nu = nu, self->rows = rows, self->changes = changes;
-  struct node *node = take(self, nodes * sizeof *node);
-  int *kids = take(self, nodes * sizeof *kids), *number = take(self, 6 * nodes * sizeof *number), at = 0;
-  for (int i = 0; i < nodes; i++) {
-    node[i].idx = i, node[i].dad = parent[i], node[i].stage = stage[i], node[i].kids = kids + at;
-    for (int k = i + 1; k < nodes; k++)
-      if (parent[k] == i) node[k].idxkid = node[i].nkids++, kids[at++] = k;
-    const int of[6] = {size(self, i), i < inner ? nu : 0, i ? rows : 0, i < inner ? nu : 0, 0, i ? rows : 0};
-    for (int k = 0; k < 6; k++) number[k * nodes + i] = of[k]; /* states, actions, bounds on each, general ones, slacks */
+/* bytes that `describe` takes */
+static size_t description(size_t nodes) {
+  uintptr_t at = 0;
+  take(&at, nodes * sizeof(struct node)), take(&at, nodes * sizeof(int)), take(&at, 6 * nodes * sizeof(int));
+  take(&at, d_tree_ocp_qp_dim_memsize(nodes)), take(&at, ARGUMENTS);
+  return at;
+}
+
+/* what HPIPM has to know before it can tell the size of the rest */
+static void describe(tree_qp *self, uintptr_t memory) {
+  tree_qp_shape *shape = &self->shape;
+  double *tolerance = &shape->tolerance;
+  const int n = shape->nodes, inner = shape->inner, nu = shape->nu, rows = shape->rows;
+  struct node *node = take(&memory, n * sizeof *node);
+  int *kids = take(&memory, n * sizeof *kids), *number = take(&memory, 6 * n * sizeof *number), at = 0;
+  memset(node, 0, n * sizeof *node);
+  for (int i = 0; i < n; i++) {
+    node[i].idx = i, node[i].dad = shape->parent[i], node[i].stage = shape->stage[i], node[i].kids = kids + at;
+    for (int k = i + 1; k < n; k++)
+      if (shape->parent[k] == i) node[k].idxkid = node[i].nkids++, kids[at++] = k;
+    const int of[6] = {size(shape, i), i < inner ? nu : 0, i ? rows : 0, i < inner ? nu : 0, 0, i ? rows : 0};
+    for (int k = 0; k < 6; k++) number[k * n + i] = of[k]; /* states, actions, bounds on each, general ones, slacks */
   }
-  self->tree.root = node, self->tree.kids = kids, self->tree.Nn = nodes;
-  d_tree_ocp_qp_dim_create(nodes, &self->dim, take(self, d_tree_ocp_qp_dim_memsize(nodes)));
-  d_tree_ocp_qp_dim_set_all(&self->tree, number, number + nodes, number + 2 * nodes, number + 3 * nodes, number + 4 * nodes,
-                            number + 5 * nodes, &self->dim);
-  d_tree_ocp_qp_create(&self->dim, &self->qp, take(self, d_tree_ocp_qp_memsize(&self->dim)));
-  d_tree_ocp_qp_sol_create(&self->dim, &self->sol, take(self, d_tree_ocp_qp_sol_memsize(&self->dim)));
-  d_tree_ocp_qp_ipm_arg_create(&self->dim, &self->arg, take(self, d_tree_ocp_qp_ipm_arg_memsize(&self->dim)));
+  self->tree.root = node, self->tree.kids = kids, self->tree.Nn = n;
+  d_tree_ocp_qp_dim_create(n, &self->dim, take(&memory, d_tree_ocp_qp_dim_memsize(n)));
+  d_tree_ocp_qp_dim_set_all(&self->tree, number, number + n, number + 2 * n, number + 3 * n, number + 4 * n, number + 5 * n, &self->dim);
+  d_tree_ocp_qp_ipm_arg_create(&self->dim, &self->arg, take(&memory, ARGUMENTS));
   d_tree_ocp_qp_ipm_arg_set_default(SPEED_ABS, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_iter_max(&most, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_stat(&tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_eq(&tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_ineq(&tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_comp(&tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_ws_create(&self->dim, &self->arg, &self->ws, take(self, d_tree_ocp_qp_ipm_ws_memsize(&self->dim, &self->arg)));
+  d_tree_ocp_qp_ipm_arg_set_iter_max(&shape->most, &self->arg);
+  d_tree_ocp_qp_ipm_arg_set_tol_stat(tolerance, &self->arg);
+  d_tree_ocp_qp_ipm_arg_set_tol_eq(tolerance, &self->arg);
+  d_tree_ocp_qp_ipm_arg_set_tol_ineq(tolerance, &self->arg);
+  d_tree_ocp_qp_ipm_arg_set_tol_comp(tolerance, &self->arg);
+}
+
+/* where everything is, and the end of it */
+static uintptr_t arrange(tree_qp *self, uintptr_t memory, void **qp, void **sol, void **ws) {
+  const tree_qp_shape *shape = &self->shape;
+  const size_t nx = shape->nx, wide = nx + shape->nu;
+  *qp = take(&memory, d_tree_ocp_qp_memsize(&self->dim));
+  *sol = take(&memory, d_tree_ocp_qp_sol_memsize(&self->dim));
+  *ws = take(&memory, d_tree_ocp_qp_ipm_ws_memsize(&self->dim, &self->arg));
+  self->scratch = take(&memory, (4 * wide * wide + 8 * wide) * sizeof(double));
+  self->positive = take(&memory, shape->nodes * nx * nx * sizeof(double));
+  self->dx = take(&memory, shape->nodes * nx * sizeof(double));
+  self->index = take(&memory, 2 * wide * sizeof(int));
+  return memory;
+}
+
+size_t tree_qp_size(const tree_qp_shape *shape) {
+  tree_qp self = {.shape = *shape};
+  char head[description(shape->nodes) + ALIGNMENT];
+  void *none;
+  describe(&self, aligned(head));
+  return ALIGNMENT + sizeof self + ALIGNMENT + description(shape->nodes) + arrange(&self, 0, &none, &none, &none);
+}
+
+tree_qp *tree_qp_init(void *memory, const tree_qp_shape *shape) {
+  memset(memory, 0, tree_qp_size(shape));
+  uintptr_t at = aligned(memory);
+  tree_qp *self = take(&at, sizeof *self);
+  void *head = take(&at, description(shape->nodes)), *qp, *sol, *ws;
+  self->shape = *shape;
+  describe(self, (uintptr_t)head);
+  arrange(self, at, &qp, &sol, &ws);
+  d_tree_ocp_qp_create(&self->dim, &self->qp, qp);
+  d_tree_ocp_qp_sol_create(&self->dim, &self->sol, sol);
+  d_tree_ocp_qp_ipm_ws_create(&self->dim, &self->arg, &self->ws, ws);
   /* what never changes: which variables have bounds and slacks, and that slack has no quadratic price */
-  const int wide = nx + nu;
-  self->scratch = take(self, (4 * wide * wide + 8 * wide) * sizeof(double));
-  self->positive = take(self, nodes * nx * nx * sizeof(double));
-  self->dx = take(self, nodes * nx * sizeof(double));
-  self->row = memcpy(take(self, rows * sizeof *row), row, rows * sizeof *row);
-  int *index = take(self, wide * sizeof *index), *soft = take(self, (rows + 1) * sizeof *soft);
+  const int wide = shape->nx + shape->nu, rows = shape->rows;
+  int *index = self->index, *soft = index + wide;
   for (int i = 0; i < wide; i++) index[i] = i;
-  for (int i = 0; i < nodes; i++) {
-    if (i < inner) {
+  for (int i = 0; i < shape->nodes; i++) {
+    if (i < shape->inner) {
       d_tree_ocp_qp_set_idxbu(i, index, &self->qp);
       if (i) d_tree_ocp_qp_set_S(i, self->scratch, &self->qp);
     }
     if (i) {
-      for (int j = 0; j < rows; j++) soft[j] = (i < inner ? nu : 0) + j;
+      for (int j = 0; j < rows; j++) soft[j] = (i < shape->inner ? shape->nu : 0) + j;
       d_tree_ocp_qp_set_b(i - 1, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_idxbx(i, (int *)row, &self->qp);
+      d_tree_ocp_qp_set_idxbx(i, (int *)shape->row, &self->qp);
       d_tree_ocp_qp_set_idxs(i, soft, &self->qp);
       d_tree_ocp_qp_set_Zl(i, self->scratch, &self->qp);
       d_tree_ocp_qp_set_Zu(i, self->scratch, &self->qp);
@@ -104,8 +140,8 @@ tree_qp *tree_qp_new(int nodes, int inner, int nx, int nu, int rows, int changes
   return self;
 }
 
-/* (H)+ by cyclic Jacobi rotations (Golub and Van Loan, section 8.5); work: 2 n^2 numbers */
-static void positive_part(int n, const double *h, double *result, double *work) {
+/* by cyclic Jacobi rotations (Golub and Van Loan, section 8.5) */
+void tree_qp_positive_part(int n, const double *h, double *result, double *work) {
   double *m = work, *v = work + n * n, total = 0;
   for (int i = 0; i < n * n; i++) {
     m[i] = (h[i] + h[i % n * n + i / n]) / 2;
@@ -141,12 +177,6 @@ static void positive_part(int n, const double *h, double *result, double *work) 
   }
 }
 
-void tree_qp_positive_part(int n, const double *h, double *result) {
-  double *work = malloc(2 * n * n * sizeof *work);
-  positive_part(n, h, result, work);
-  free(work);
-}
-
 /* a, (rows, columns), in the upper left corner of zeros; a itself where nothing is added */
 static double *widened(const double *a, int rows, int columns, int all_rows, int all_columns, double *scratch) {
   if (rows == all_rows && columns == all_columns) return (double *)a;
@@ -158,14 +188,14 @@ static double *widened(const double *a, int rows, int columns, int all_rows, int
 /* what is minimised, at du */
 static double cost_at(tree_qp *self, const double *du, const double *A, const double *B, const double *q, const double *x_low,
                       const double *x_high, const double *price, const double *c, const double *moved) {
-  const int nx = self->nx, nu = self->nu, rows = self->rows;
+  const int nx = self->shape.nx, nu = self->shape.nu, rows = self->shape.rows;
   double cost = 0;
-  for (int i = 0; i < self->inner; i++)
+  for (int i = 0; i < self->shape.inner; i++)
     for (int k = 0; k < nu; k++) {
       const double step = du[nu * i + k] - (i ? du[nu * self->tree.root[i].dad + k] : 0);
       cost += c[nu * i + k] * (step + 2 * moved[nu * i + k]) * step;
     }
-  for (int i = 1; i < self->nodes; i++) {
+  for (int i = 1; i < self->shape.nodes; i++) {
     const int e = i - 1, dad = self->tree.root[i].dad;
     const double *H = self->positive + nx * nx * e, *before = dad ? self->dx + nx * (dad - 1) : NULL;
     double *x = self->dx + nx * e;
@@ -179,44 +209,42 @@ static double cost_at(tree_qp *self, const double *du, const double *A, const do
       for (int k = 0; k < nx; k++) cost += H[nx * k + j] * x[j] * x[k] / 2;
     }
     for (int j = 0; j < rows; j++) {
-      const double at = x[self->row[j]], *p = price + 2 * rows * e;
+      const double at = x[self->shape.row[j]], *p = price + 2 * rows * e;
       cost += p[j] * fmax(x_low[rows * e + j] - at, 0) + p[rows + j] * fmax(at - x_high[rows * e + j], 0);
     }
   }
   return cost;
 }
 
-/* 0 if solved, HPIPM's status otherwise. Bounds relative to the present plan; x_low, x_high: of the bounded states, price: (2, rows) per
-   node, below and above; barrier: where the interior point starts, about the largest price */
 int tree_qp_solve(tree_qp *self, const double *A, const double *B, const double *q, const double *H, const double *u_low,
                   const double *u_high, const double *x_low, const double *x_high, const double *price, const double *c,
                   const double *moved, double barrier, double *du, double *cost, int *iterations) {
-  const int nx = self->nx, nu = self->nu, rows = self->rows, wide = nx + nu;
+  const int nx = self->shape.nx, nu = self->shape.nu, rows = self->shape.rows, wide = nx + nu;
   double *s = self->scratch, *work = s + wide * wide;
   struct d_tree_ocp_qp *qp = &self->qp;
   int status;
-  for (int i = 0; i < self->nodes; i++) {
-    if (i < self->inner) {
+  for (int i = 0; i < self->shape.nodes; i++) {
+    if (i < self->shape.inner) {
       d_tree_ocp_qp_set_lbu(i, (double *)u_low + nu * i, qp);
       d_tree_ocp_qp_set_ubu(i, (double *)u_high + nu * i, qp);
       memset(s, 0, nu * (nu + 1) * sizeof *s);
       for (int k = 0; k < nu; k++) s[k * nu + k] = RIDGE + 2 * c[nu * i + k], s[nu * nu + k] = 2 * c[nu * i + k] * moved[nu * i + k];
       d_tree_ocp_qp_set_R(i, s, qp);
       d_tree_ocp_qp_set_r(i, s + nu * nu, qp);
-      if (i && self->changes) {
+      if (i && self->shape.changes) {
         memset(s, 0, nu * wide * sizeof *s);
         for (int k = 0; k < nu; k++) s[(nx + k) * nu + k] = -2 * c[nu * i + k];
         d_tree_ocp_qp_set_S(i, s, qp);
       }
     }
     if (i == 0) continue;
-    const int e = i - 1, here = size(self, i), before = size(self, self->tree.root[i].dad);
+    const int e = i - 1, here = size(&self->shape, i), before = size(&self->shape, self->tree.root[i].dad);
     if (before) d_tree_ocp_qp_set_A(e, widened(A + nx * nx * e, nx, nx, here, before, s), qp);
     double *b = widened(B + nx * nu * e, nx, nu, here, nu, s);
     for (int k = 0; k < here - nx; k++) b[k * here + nx + k] = 1; /* the action is the next node's action before */
     d_tree_ocp_qp_set_B(e, b, qp);
     double *positive = self->positive + nx * nx * e;
-    positive_part(nx, H + nx * nx * e, positive, work);
+    tree_qp_positive_part(nx, H + nx * nx * e, positive, work);
     double *Q = widened(positive, nx, nx, here, here, s);
     for (int k = 0; k < here - nx; k++) Q[(nx + k) * here + nx + k] = 2 * c[nu * i + k];
     d_tree_ocp_qp_set_Q(i, Q, qp);
@@ -232,7 +260,7 @@ int tree_qp_solve(tree_qp *self, const double *A, const double *B, const double 
   d_tree_ocp_qp_ipm_solve(qp, &self->sol, &self->arg, &self->ws);
   d_tree_ocp_qp_ipm_get_iter(&self->ws, iterations);
   d_tree_ocp_qp_ipm_get_status(&self->ws, &status);
-  for (int i = 0; i < self->inner; i++) {
+  for (int i = 0; i < self->shape.inner; i++) {
     d_tree_ocp_qp_sol_get_u(i, &self->sol, du + nu * i);
     for (int k = nu * i; k < nu * (i + 1); k++) du[k] = du[k] < u_low[k] ? u_low[k] : du[k] > u_high[k] ? u_high[k] : du[k];
   }

@@ -1,0 +1,36 @@
+/* The quadratic program of a scenario tree; tree_qp.c says which. Matrices are stored column by column, everything else node by node.
+   No globals; all memory is the caller's. Compile it without -ffast-math: not-a-number must stay what it is. */
+
+#ifndef TREE_QP_H
+#define TREE_QP_H
+
+#include <stddef.h>
+
+typedef struct tree_qp tree_qp;
+
+/* A tree: parents come before their children, nodes with children before all others.
+   parent, stage: of every node, the root's parent is -1; row: the bounded states; changes: whether a change of the actions has a price */
+typedef struct {
+  int nodes, inner, nx, nu, rows, changes; /* inner: nodes with children */
+  const int *parent, *stage, *row;         /* they stay the caller's, and must stay */
+  double tolerance;                        /* of the interior point's residuals */
+  int most;                                /* iterations of it */
+} tree_qp_shape;
+
+/* Bytes that tree_qp_init takes. Takes a hundred and fifty bytes per node of the stack. */
+size_t tree_qp_size(const tree_qp_shape *shape);
+
+/* A solver in the memory given, at any address. */
+tree_qp *tree_qp_init(void *memory, const tree_qp_shape *shape);
+
+/* 0 if solved, HPIPM's status otherwise. Bounds are relative to the present plan; x_low, x_high: of the bounded states, price: (2, rows)
+   per node, below and above; barrier: where the interior point starts, about the largest price. Finds du, the cost there, and how many
+   iterations it took. */
+int tree_qp_solve(tree_qp *self, const double *A, const double *B, const double *q, const double *H, const double *u_low,
+                  const double *u_high, const double *x_low, const double *x_high, const double *price, const double *c,
+                  const double *moved, double barrier, double *du, double *cost, int *iterations);
+
+/* Projection of the symmetric part of h, (n, n), to positive semidefinite matrices; work: 2 n^2 numbers */
+void tree_qp_positive_part(int n, const double *h, double *result, double *work);
+
+#endif
