@@ -19,6 +19,7 @@ and robust MPC.
     python rl_mpc_deploy.py --horizon 5 --critic runs/NAME/checkpoint.pt    # your own
     python rl_mpc_deploy.py --offset-free                                   # an estimate takes the offset
     python rl_mpc_deploy.py --horizon 0 --episodes 20 --goal 0.7            # the critic's best action
+    python rl_mpc_deploy.py --horizon 5 --export-c controller               # the controller in C
 
 It writes `runs/{env}__rl_mpc_deploy__{seed}__{time}/`: results.csv (a row per controller and episode),
 trajectories.npz and episode.png. Only the folder `envs/` is needed beside this file, and a checkpoint.
@@ -43,6 +44,7 @@ from envs.control.compiled import OnArrays, compiled_functions
 from envs.control.controllers import ActorController, Controller, GreedyController, call, checked_problem
 from envs.control.estimation import build_estimator
 from envs.control.expansion import check_export, expansion
+from envs.control.export import export_c
 from envs.control.model import prediction_model, scaling
 from envs.control.tree_qp import ScenarioTree, tree_qp
 from envs.script.arguments import as_annotated, check_effects, check_ranges, check_weights
@@ -52,16 +54,10 @@ from envs.script.figure import draw_episode
 # arguments that results.csv has columns for, or that change no result
 ELSEWHERE = {"env", "horizon", "critic", "goal", "seed", "episodes", "jobs", "controllers", "compile", "out"}
 HARD_PRICE = 1e3  # of a hard bound per physical unit: above the multipliers, so that it is an exact penalty
-HARDLY_MOVED = 0.03  # half-widths of the box of initial states
-SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that keeps a tenth of its promise
-STATIONARY = 1e-4  # share of the cost: a plan that came this close to the predicted cost is left as it is
 Name = Literal["actor", "nominal_mpc", "robust_mpc", "goal_mpc", "rl_mpc"]
 LABELS = {"actor": "RL (actor alone)", "nominal_mpc": "nominal MPC", "robust_mpc": "robust MPC"}
 LABELS |= {"goal_mpc": "RL+MPC, no value", "rl_mpc": "RL+MPC"}
-COLOURS, DASHES = (
-    ("#D55E00", "#999999", "#0072B2", "#E69F00", "#009E73"),
-    ("--", ":", "-.", (0, (4, 1, 1, 1)), "-"),
-)
+COLOURS, DASHES = "#D55E00 #999999 #0072B2 #E69F00 #009E73".split(), ("--", ":", "-.", (0, (4, 1, 1, 1)), "-")
 STYLES = {name: {"color": colour, "ls": dashes} for name, colour, dashes in zip(LABELS, COLOURS, DASHES)}
 
 
@@ -121,6 +117,8 @@ class Args:
     """translate the planners to C and compile them once (kept in $XDG_CACHE_HOME/rlmpc, or ~/.cache/rlmpc)"""
     out: Path | None = None
     """folder of the results; default: runs/{env}__rl_mpc_deploy__{seed}__{time}"""
+    export_c: Path | None = None
+    """a folder: write RL+MPC into it as C code, and compare nothing"""
 
     __post_init__ = as_annotated
 
@@ -147,10 +145,7 @@ class Critic:
         actor, critic = ({k: v.double().numpy() for k, v in data[net].items()} for net in ("actor", "critic"))
         names = [*(f"layers.{i}" for i in range(len(sizes) - 1)), "head"]
         actor = [(actor[f"{name}.weight"], actor[f"{name}.bias"][:, None]) for name in names]
-        self.actor = [
-            *actor[:-1],
-            tuple(part[:n_u] for part in actor[-1]),
-        ]  # the rest is a standard deviation
+        self.actor = [*actor[:-1], tuple(part[:n_u] for part in actor[-1])]  # the rest: standard deviations
         pairs = [(critic[f"weight.{i}"], critic[f"bias.{i}"]) for i in range(len(sizes))]
         self.twins = [[(w[j].T, b[j].T) for w, b in pairs] for j in range(2)]
         # what torch would refuse, and what is no use
@@ -236,6 +231,10 @@ class ScenarioMPC(Controller):
     limit, late, unsolved: the quadratic program, stalled: no share of a step helps), predicted (last decrease).
     """
 
+    HARDLY_MOVED = 0.03  # half-widths of the box of initial states
+    SHARES = 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32  # of a step, the first that keeps a tenth of its promise
+    STATIONARY = 1e-4  # share of the cost: a plan that came this close to the predicted cost is left as it is
+
     def __init__(
         self,
         plant,
@@ -276,16 +275,16 @@ class ScenarioMPC(Controller):
         self.change_weight = change_weight * self.u_scale**2
         self.qp = tree_qp(self.tree, len(plant.X_LOW), len(plant.U_LOW), active, change_weight.any(), compile)
         super().__init__(plant, goal, estimator)
-        functions = self._functions(stage_cost, value, expansion)
-        functions = compiled_functions(functions) if compile else functions
-        self.rollout, self.linearise, *follow = map(OnArrays, functions)
-        self.follow = follow[0] if follow else None
+        self.functions = self._functions(stage_cost, value, expansion)
+        functions = compiled_functions(self.functions) if compile else self.functions
+        self.rollout, self.linearise, *policy = map(OnArrays, functions)
+        self.follow, self.mu = policy or (None, None)
 
     def _functions(self, stage_cost, value, expansion):
         """CasADi functions of what `_problem` gives, scaled, a column per node but the root.
 
         rollout (..., u) -> cost, states; linearise (..., u) -> states, A, B, slopes and Hessians of the costs;
-        follow (...) -> the policy's actions.
+        follow (...) -> the policy's actions; mu (x, goal, mismatch) -> its action, physical units.
         """
         tree, N, S, rows = self.tree, self.horizon, len(self.scenarios), self.rows.tolist()
         n_x, n_u, n_goal = len(self.x_scale), len(self.u_scale), len(self.plant.GOAL_INDEX)
@@ -358,7 +357,8 @@ class ScenarioMPC(Controller):
             return actions[-1]
 
         rolled_out(step, policy_action)
-        return [rollout, linearise, ca.Function("follow", problem, [ca.horzcat(*actions)])]
+        mu = ca.Function("mu", [x, g, m], [call(self.policy, x, g, m)])
+        return [rollout, linearise, ca.Function("follow", problem, [ca.horzcat(*actions)]), mu]
 
     def reset(self, u=None):
         super().reset(u)
@@ -378,7 +378,7 @@ class ScenarioMPC(Controller):
         if self.plan is not None:
             found["shifted"] = self.plan[self.tree.later]
             # where things move, an action that is planned for later would be put off for ever
-            if np.abs((x - self.x_before) / self.x_scale).max() < HARDLY_MOVED:
+            if np.abs((x - self.x_before) / self.x_scale).max() < self.HARDLY_MOVED:
                 found["last"] = self.plan
         if self.policy is None:
             found["middle"] = np.zeros((self.tree.inner, len(self.u_scale)))
@@ -411,8 +411,8 @@ class ScenarioMPC(Controller):
                 break
             slack = np.vdot(price[:, 0], np.maximum(low, 0)) + np.vdot(price[:, 1], np.maximum(-high, 0))
             self.stats["predicted"] = predicted = slack - found
-            tolerance, before = STATIONARY * abs(cost), cost
-            for share in SHARES if predicted > tolerance else SHARES[:1]:
+            tolerance, before = self.STATIONARY * abs(cost), cost
+            for share in self.SHARES if predicted > tolerance else self.SHARES[:1]:
                 new = np.clip(u + share * step, -1, 1)
                 new_cost = self._cost(new)
                 if new_cost < before and not before - new_cost < 0.1 * share * predicted:
@@ -430,9 +430,8 @@ class ScenarioMPC(Controller):
         costs = {name: cost for name, u in guesses.items() if np.isfinite(cost := self._cost(u))}
         if not costs:
             self.plan, self.stats["fell_back"] = None, True
-            if self.policy is None:
-                return np.array([np.nan])
-            return np.array(call(self.policy, x, self.goals[:, 0], self.estimator.mismatch)).ravel()
+            known = x, self.goals[:, 0], self.estimator.mismatch
+            return self.mu(*known)[0][0] if self.mu else np.full(1, np.nan)
         best = min(costs, key=costs.get)
         self.stats |= dict(rung="plan", guess=best, guess_cost=costs[best], stop="limit", predicted=0.0)
         self.plan, self.stats["cost"] = self.improve(guesses[best], costs[best], tick)
@@ -577,6 +576,8 @@ def check(args):
     if args.constraints == "hard":
         unused["slack_weight"] = unused["slack_weight"] or "on hard constraints"
     unused |= {"estimator": "with --offset-free" * args.offset_free}
+    comparing = ("episodes", "steps", "seed", "jobs", "controllers", "out")
+    unused |= dict.fromkeys(comparing, "with --export-c" if args.export_c else "")
     check_effects(args, unused)
     if args.horizon == 0 and "goal_mpc" in args.controllers:
         raise ValueError("--horizon is 0; --controllers goal_mpc plans, so that it must be at least 1")
@@ -599,11 +600,12 @@ def main(args):
         print("notice: robust MPC is left out; with a single scenario it is nominal MPC", file=sys.stderr)
     if not envs.can_hold(plant, goal):
         print(f"warning: --goal {args.goal} is not a goal that every scenario can hold", file=sys.stderr)
-    out = output_folder(
-        args.out, Path("runs") / f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}"
-    )
     difference = check_export(critic, export(critic)[2])
     print(f"{critic_path(args)}: the CasADi export equals torch to {difference:.0e}", flush=True)
+    if args.export_c:
+        return export_c(build_controller("rl_mpc", args), args.export_c, noise=args.noise)
+    name = f"{args.env}__rl_mpc_deploy__{args.seed}__{int(time.time())}"
+    out = output_folder(args.out, Path("runs") / name)
     tick = time.perf_counter()
     found = compare(args, names)
     rows = [found[name, i][2] for name in names for i in range(args.episodes)]
@@ -617,11 +619,10 @@ def main(args):
     lines = {label(found[name, None][2]): (*found[name, None][:2], STYLES[name]) for name in shown}
     draw_episode(plant, lines, np.tile(goal, (args.steps, 1)), out / "episode.png")
     print(table(rows))
-    seconds = time.perf_counter() - tick
     print(
-        f"{args.episodes} paired draws in {seconds:.0f} s; {out}/results.csv, trajectories.npz and episode.png,"
+        f"{args.episodes} paired draws in {time.perf_counter() - tick:.0f} s; {out}/results.csv, trajectories.npz"
     )
-    print("which starts from the plant's own start state and has nominal parameters")
+    print("and episode.png, which starts from the plant's own start state and has nominal parameters")
     return rows
 
 

@@ -36,7 +36,9 @@ ENVS = ROOT / "envs"
 TRAINING = ROOT / "sac_her_branching.py"
 SCRIPTS = TRAINING, ROOT / "goal_mpc.py", ROOT / "rl_mpc_deploy.py"
 # all code as it was when this process began: an edit while it runs does not file old results under new code
-FILES = sorted(path for place in (ENVS, HERE) for path in place.rglob("*") if path.suffix in (".py", ".c"))
+FILES = sorted(
+    path for place in (ENVS, HERE) for path in place.rglob("*") if path.suffix in (".py", ".c", ".h")
+)
 CODE = {path: path.read_bytes() for path in (*SCRIPTS, *FILES)}
 
 

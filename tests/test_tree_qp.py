@@ -1,6 +1,5 @@
 """The quadratic programs of a scenario tree: HPIPM's answers against PIQP's, HiGHS's and qpOASES's, costs against numpy."""
 
-import ctypes
 import gc
 import os
 import shutil

@@ -33,15 +33,21 @@ def vectorised(source):
     return head + product + rest if start >= 0 else source
 
 
+def find_compiler():
+    """Path of the C compiler. Raises OSError where there is none."""
+    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
+    if compiler is None:
+        raise OSError("no gcc, clang or cc")
+    return compiler
+
+
 def compiled(source, *flags, link=("-lm",)):
     """Path of the shared library made of C code.
 
     It is kept in a cache folder under a hash of source, flags, compiler and processor, and appears there by an atomic rename, so that
     parallel processes may race for it. Raises OSError (no compiler, no place to write) or subprocess.CalledProcessError.
     """
-    compiler = next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
-    if compiler is None:
-        raise OSError("no gcc, clang or cc")
+    compiler = find_compiler()
     version = subprocess.run([compiler, "--version"], capture_output=True, check=True).stdout
     info = Path("/proc/cpuinfo")
     found = re.search(r"^(flags|Features)\s*:.*", info.read_text() if info.exists() else "", re.MULTILINE)
@@ -99,18 +105,23 @@ def compiled_solver(plugin, nlp, options):
         return None
 
 
+def generated(functions, name="functions.c"):
+    """C code of CasADi functions; the name of the file begins that of what they share."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        code = ca.CodeGenerator(name)
+        for function in functions:
+            code.add(function)
+        code.generate()
+        return vectorised(Path(name).read_text())
+
+
 def compiled_functions(functions):
     """CasADi functions as compiled ones, in order, or as they are where they cannot be compiled, with a notice.
 
     -ffast-math makes them twice as fast: whether a result is finite must be asked outside.
     """
     try:
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            code = ca.CodeGenerator("functions.c")
-            for function in functions:
-                code.add(function)
-            code.generate()
-            library = compiled(vectorised(Path("functions.c").read_text()), "-ffast-math")
+        library = compiled(generated(functions), "-ffast-math")
         return [ca.external(function.name(), str(library)) for function in functions]
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
         _notice(error)

@@ -1,5 +1,7 @@
 """What a controller knows of its plant: the measurement itself, an extended Kalman filter, or particles."""
 
+import itertools
+
 import casadi as ca
 import numpy as np
 
@@ -154,10 +156,11 @@ class KalmanFilter(Filter):
         off = np.repeat([3**-0.5, DISTURBANCE], [self.known, len(self.measured)])  # uniform in its box
         self.prior, later = off**2, off**2 * (np.arange(len(off)) >= self.n)
         walk = np.append(np.full(self.n, STATE_NOISE), WALK * off[self.n :]) ** 2
-        functions = self.functions(np.diag(walk), np.diag(later))
-        self.predict, self.correct = map(OnArrays, compiled_functions(functions) if compile else functions)
+        self.functions = [*self._functions(np.diag(walk), np.diag(later)), self._axes()]
+        compiled = compiled_functions(self.functions) if compile else self.functions
+        self.predict, self.correct, self.axes = map(OnArrays, compiled)
 
-    def functions(self, walk, later):
+    def _functions(self, walk, later):
         """CasADi functions: predict (z, P, u) -> z, P, and P if things have changed, one sampling time later; correct (these, y, present,
         whether it has been wrong before) -> z, P and the squared distance of each measurement in standard deviations."""
         n, known, m, size = self.n, self.known, len(self.measured), len(walk)
@@ -189,6 +192,32 @@ class KalmanFilter(Filter):
         given = [z, P, changed, y, present, before]
         return predict, ca.Function("correct", given, [state, covariance, ca.vertcat(*far)])
 
+    def _axes(self, sweeps=8):
+        """CasADi function P -> the axes along which state and parameters are uncertain, a column each as long as a standard deviation,
+        the longest first; by cyclic Jacobi rotations (Golub and Van Loan, section 8.5), so that they move little when P does."""
+        n, size = self.known, len(self.prior)
+        M, V, p, q = ca.SX.sym("M", n, n), ca.SX.sym("V", n, n), ca.SX.sym("p", n), ca.SX.sym("q", n)
+        a, d = 2 * ca.bilin(M, p, q), ca.bilin(M, q, q) - ca.bilin(M, p, p)
+        t = a / (d + ca.if_else(d < 0, -1, 1) * ca.sqrt(d**2 + a**2) + 1e-300)
+        c = 1 / ca.sqrt(t**2 + 1)
+
+        def rotated(m):
+            return m + (((c - 1) * m @ p - t * c * m @ q) @ p.T + (t * c * m @ p + (c - 1) * m @ q) @ q.T)
+
+        after = [rotated(rotated(M).T), rotated(V)]
+        rotate, unit = ca.Function("rotate", [M, V, p, q], after, {"never_inline": True}), np.eye(n)
+        P = ca.MX.sym("P", size, size)
+        M = (P + P.T)[:n, :n] / 2 + np.diag(DOUBT**2 * (np.arange(n) >= self.n))
+        V = ca.MX(unit)
+        for first, second in list(itertools.combinations(unit, 2)) * sweeps:
+            M, V = rotate(M, V, first, second)
+        variance = ca.fmax(ca.diag(M), 0)
+        longer = ca.repmat(variance, 1, n) > ca.repmat(variance.T, n, 1)
+        longer += (ca.repmat(variance, 1, n) == ca.repmat(variance.T, n, 1)) * np.triu(np.ones((n, n)), 1)
+        rank = ca.sum1(longer)  # how many are longer
+        place = ca.repmat(rank.T, 1, n) == ca.repmat(ca.DM(range(n)).T, n, 1)
+        return ca.Function("axes", [P], [ca.densify((V * ca.repmat(ca.sqrt(variance).T, n, 1)) @ place)])
+
     def begin(self, y, present):
         """The middle of the boxes, and what is measured as it is."""
         self.z, variance, i = np.zeros(len(self.prior)), self.prior.copy(), self.measured[present]
@@ -205,10 +234,7 @@ class KalmanFilter(Filter):
         return ~(self.far < GATE)
 
     def points(self, S):
-        doubt = np.diag(DOUBT**2 * (np.arange(self.known) >= self.n))
-        variance, axes = np.linalg.eigh(self.P[: self.known, : self.known] + doubt)
-        most = np.argsort(variance)[::-1][: (S - 1) // 2]  # fewer if z is short
-        moves = (axes[:, most] * np.sqrt(np.maximum(variance[most], 0) * S / 2)).T
+        moves = self.axes(self.P)[0][: (S - 1) // 2] * np.sqrt(S / 2)  # fewer if z is short
         moves = np.concatenate([np.zeros((S - 2 * len(moves), self.known)), moves, -moves])
         return self.z[: self.known] + moves, np.full(S, 1 / S)
 
