@@ -18,10 +18,9 @@ def plant():
     return envs.load("cstr")
 
 
-@pytest.fixture(scope="session")
-def checkpoint(tmp_path_factory, plant):
+def untrained(plant, path, **options):
     """An untrained but not trivial checkpoint.pt, written by the training script's own functions."""
-    args = training.Args(seed=3)
+    args = training.Args(seed=3, env=plant.name, **options)
     agent = training.SAC(args, plant)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -29,9 +28,13 @@ def checkpoint(tmp_path_factory, plant):
             parameter += (
                 0.3 * torch.randn(parameter.shape, generator=generator) / np.sqrt(parameter.shape[-1])
             )
-    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt"
     training.save(training.checkpoint(agent, training.plain(args), step=0), path)
     return path
+
+
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory, plant):
+    return untrained(plant, tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt")
 
 
 def pytest_collection_modifyitems(items):

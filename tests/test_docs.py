@@ -74,6 +74,10 @@ def test_every_command_of_the_three_scripts_runs(script, words, checkpoint, tmp_
     words = [re.sub("@120|@240|^360$", lambda match: shorter[match[0]], word) for word in words]
     args = tyro.cli(module.Args, args=words)
     module.check(args)
+    if getattr(args, "export_c", None):
+        module.main(replace(args, export_c=tmp_path))
+        assert (tmp_path / "rl_mpc.h").exists()
+        return
     if module is sac_her_branching:
         few = dict(total_timesteps=640, learning_starts=320, num_envs=32, eval_episodes=4, buffer_size=3200)
     elif module is rl_mpc_deploy:
@@ -153,6 +157,13 @@ def test_the_worked_example_from_equations_to_deployed_controller(tmp_path):
         out = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert out.returncode == 0, out.stderr
     assert "RL+MPC" in out.stdout
+    # the same controller in C
+    command = [*command[:-4], "--export-c", "controller"]
+    assert subprocess.run(command, cwd=tmp_path, timeout=300).returncode == 0
+    out = subprocess.run(
+        ["make", "-s", "-C", "controller"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert out.returncode == 0 and "100 of 100 actions" in out.stdout, out.stderr
 
 
 def test_links_files_and_figures_exist():

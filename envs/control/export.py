@@ -228,6 +228,8 @@ def code(controller):
     """{name: text} of the files that make the controller and the plant, but for what is counted and recorded."""
     plant, estimator = controller.plant, controller.estimator
     functions = [*controller.functions, *getattr(estimator, "functions", ())]
+    if getattr(estimator, "certain", False):  # no sigma points
+        functions = [f for f in functions if f.name() != "axes"]
     data = [
         "/* The numbers of this controller; rl_mpc.c says what they are. */",
         defined(settings(controller, functions)),
