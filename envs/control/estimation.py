@@ -198,7 +198,7 @@ class KalmanFilter(Filter):
         n, size = self.known, len(self.prior)
         M, V, p, q = ca.SX.sym("M", n, n), ca.SX.sym("V", n, n), ca.SX.sym("p", n), ca.SX.sym("q", n)
         a, d = 2 * ca.bilin(M, p, q), ca.bilin(M, q, q) - ca.bilin(M, p, p)
-        t = a / (d + ca.if_else(d < 0, -1, 1) * ca.sqrt(d**2 + a**2) + 1e-300)
+        t = a / (d + ca.if_else(d < 0, -1, 1) * ca.sqrt(d**2 + a**2) + 1e-30)
         c = 1 / ca.sqrt(t**2 + 1)
 
         def rotated(m):

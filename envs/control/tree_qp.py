@@ -1,6 +1,7 @@
 """A scenario tree and its quadratic program (c/tree_qp.c says which), by HPIPM from the CasADi wheel or by a solver of CasADi's `conic`."""
 
 import ctypes
+import re
 import subprocess
 import sys
 
@@ -103,9 +104,9 @@ class TreeQP:
     """
 
     def __init__(self, tree, n_x, n_u, active, changes):
-        header, source = ((C_SOURCES / f"tree_qp.{kind}").read_text() for kind in "hc")
+        sources = [(C_SOURCES / name).read_text() for name in ("real.h", "tree_qp.h", "tree_qp.c")]
         search = [f"-L{WHEEL}", "-lhpipm", "-lblasfeo", "-lm", f"-Wl,-rpath,{WHEEL}"]
-        whole = header + source.replace('#include "tree_qp.h"', "")
+        whole = re.sub(r'#include ".*"', "", "".join(sources))
         self.library = ctypes.CDLL(str(compiled(whole, f"-I{WHEEL / 'include'}", link=search)))
         self.library.tree_qp_size.restype = ctypes.c_size_t
         self.library.tree_qp_init.restype = ctypes.c_void_p

@@ -42,6 +42,7 @@ CONFIGURED = {  # label: keywords of rl_mpc_deploy.Args
     "c_A unmeasured, noise 0.5 %": dict(estimator="ekf", measure=("sensors",), noise=0.005),
     "hard bounds, price of changes": dict(constraints="hard", change_weight=(1e-3, 0.0)),
 }
+SINGLE = "-DRL_MPC_SINGLE"
 HERE = "-O3 -march=native -fPIC"  # the flags of the Makefile
 BUILDS = {  # label: (compiler, flags, arguments of make)
     "gcc, the flags of Python": ("gcc", HERE, ()),
@@ -51,7 +52,9 @@ BUILDS = {  # label: (compiler, flags, arguments of make)
     "clang": ("clang", "-O3 -march=native", ()),
     "aarch64, gcc": ("aarch64-linux-gnu-gcc", "-O3", ()),
 }
-DRAWS = ("N = 5", "N = 5", HERE), ("offset-free", "offset-free", HERE), ("N = 5, gcc -O2", "N = 5", "-O2")
+OFTEN = "N = 5", "offset-free", "c_A unmeasured, noise 0.5 %"
+DRAWS = [(label, flags) for flags in (HERE, f"{HERE} {SINGLE}") for label in OFTEN] + [("N = 5", "-O2")]
+TIMED = ("N = 5", 5, HERE), ("N = 5", 3, HERE), ("N = 1", 3, HERE), ("N = 5", 3, f"{HERE} {SINGLE}")
 M7 = "-O2 -mcpu=cortex-m7 -mfpu=fpv5-d16 -mfloat-abi=hard -mthumb"
 
 
@@ -75,26 +78,21 @@ def make(folder, *targets, compiler="gcc", flags=HERE, more=()):
     return found.stdout
 
 
-class Info(ctypes.Structure):
-    """rl_mpc_info."""
-
-    _fields_ = [(name, ctypes.c_int) for name in ("rung", "guess", "stop", "iterations")]
-    _fields_ += [(name, ctypes.c_double) for name in ("guess_cost", "cost", "predicted")]
-    _fields_ += [("rejected", ctypes.c_uint), ("restarted", ctypes.c_int)]
-
-
-def state_type(folder):
-    """rl_mpc_state as a ctypes structure, by the sizes in rl_mpc.h."""
+def structures(folder, real):
+    """rl_mpc_state and rl_mpc_info as ctypes structures, by the sizes in rl_mpc.h."""
     size = {k: int(v) for k, v in re.findall(r"RL_MPC_(\w+) (\d+)\b", (folder / "rl_mpc.h").read_text())}
     n_x, n_u, n_y, n_z = (size[name] for name in ("NX", "NU", "NY", "NZ"))
-    fields = [("begun", ctypes.c_int), ("planned", ctypes.c_int), ("x", ctypes.c_double * n_x)]
-    fields += [("u", ctypes.c_double * n_u), ("plan", ctypes.c_double * (size["INNER"] * n_u))]
+    state = [("begun", ctypes.c_int), ("planned", ctypes.c_int), ("x", real * n_x)]
+    state += [("u", real * n_u), ("plan", real * (size["INNER"] * n_u))]
     if n_z:
-        fields += [("known", ctypes.c_int), ("z", ctypes.c_double * n_z), ("P", ctypes.c_double * n_z**2)]
-        fields += [("last", ctypes.c_double * n_y), ("wrong_for", ctypes.c_int * n_y)]
-    fields += [("iterations", ctypes.c_int), ("deadline_ms", ctypes.c_double)]
-    fields += [("now_ms", ctypes.c_void_p), ("work", ctypes.c_void_p)]
-    return type("State", (ctypes.Structure,), {"_fields_": fields})
+        state += [("known", ctypes.c_int), ("z", real * n_z), ("P", real * n_z**2)]
+        state += [("last", real * n_y), ("wrong_for", ctypes.c_int * n_y)]
+    state += [("iterations", ctypes.c_int), ("deadline_ms", ctypes.c_double)]
+    state += [("now_ms", ctypes.c_void_p), ("work", ctypes.c_void_p)]
+    info = [(name, ctypes.c_int) for name in ("rung", "guess", "stop", "iterations")]
+    info += [(name, real) for name in ("guess_cost", "cost", "predicted")]
+    info += [("rejected", ctypes.c_uint), ("restarted", ctypes.c_int)]
+    return [type("Structure", (ctypes.Structure,), {"_fields_": fields})() for fields in (state, info)]
 
 
 class Exported:
@@ -102,27 +100,25 @@ class Exported:
 
     def __init__(self, folder, controller, flags=HERE):
         make(folder, "librl_mpc.so", flags=flags)
-        self.library, self.state, self.info = (
-            ctypes.CDLL(f"{folder}/librl_mpc.so"),
-            state_type(folder)(),
-            Info(),
-        )
+        self.library = ctypes.CDLL(f"{folder}/librl_mpc.so")
+        self.real, real = (np.float32, ctypes.c_float) if SINGLE in flags else (np.float64, ctypes.c_double)
+        self.state, self.info = structures(folder, real)
         self.library.rl_mpc_size.restype = ctypes.c_size_t
         self.memory = ctypes.create_string_buffer(self.library.rl_mpc_size())
         size = ctypes.c_size_t(len(self.memory))
         assert self.library.rl_mpc_init(ctypes.byref(self.state), self.memory, size) == 0
         self.plant, self.estimator = controller.plant, SimpleNamespace(measured=controller.estimator.measured)
-        self.u = np.zeros(len(self.plant.U_LOW))
+        self.u = np.zeros(len(self.plant.U_LOW), dtype=self.real)
         self.set_goal(controller.goal)
 
     def reset(self):
         self.library.rl_mpc_reset(ctypes.byref(self.state), None)
 
     def set_goal(self, goal):
-        self.goal = np.array(goal, dtype=float).reshape(-1)
+        self.goal = np.array(goal, dtype=self.real).reshape(-1)
 
     def make_step(self, y):
-        y = np.array(y, dtype=float)
+        y = np.array(y, dtype=self.real)
         arrays = [ctypes.c_void_p(a.ctypes.data) for a in (y, self.goal, self.u)]
         pointers = ctypes.byref(self.state), *arrays, ctypes.byref(self.info)
         tick = time.perf_counter()
@@ -132,15 +128,15 @@ class Exported:
             raise ValueError(f"rl_mpc_step returned {code}")
         self.stats = {"iterations": self.info.iterations, "wall_ms": took, "rung": self.info.rung}
         self.stats |= {"late": self.info.stop == 2, "fell_back": self.info.rung > 0}
-        return self.u.copy()
+        return self.u.astype(float)
 
 
-def exported(folder, records=100, **options):
+def exported(folder, records=100, flags=HERE, **options):
     """Controllers in Python and in C, by keywords of rl_mpc_deploy.Args."""
     args = deploy.Args(**options)
     controller = deploy.build_controller("rl_mpc", args)
     export_c(controller, folder, records, args.noise)
-    return controller, Exported(folder, controller)
+    return controller, Exported(folder, controller, flags)
 
 
 def equal(args, folder):
@@ -190,21 +186,25 @@ def elsewhere(args, folder):
 
 def in_draws(args, folder):
     rows = []
-    for label, options, flags in DRAWS[: 1 if args.quick else None]:
-        controller = deploy.build_controller("rl_mpc", deploy.Args(**CONFIGURED[options]))
-        export_c(controller, folder / label, 2)
-        c = Exported(folder / label, controller, flags)
-        for i, (x, psi) in enumerate(zip(*draws(c.plant, args.episodes, args.seed))):
-            row = run_episode(c, c.plant, x, psi, c.goal, 3 if args.quick else 100)[2]
+    for label, flags in DRAWS[: 1 if args.quick else None]:
+        options = CONFIGURED[label]
+        python, c = exported(folder / f"{len(rows)}", 2, flags, **options)
+        label += ", single" * (SINGLE in flags) + ", gcc -O2" * ("-O2" in flags)
+        for i, (x, psi) in enumerate(
+            tqdm(list(zip(*draws(c.plant, args.episodes, args.seed))), disable=None)
+        ):
+            rng, steps = np.random.default_rng([args.seed, 7, i + 1]), 3 if args.quick else 100
+            row = run_episode(c, c.plant, x, psi, python.goal, steps, options.get("noise", 0), rng)[2]
             rows.append({"controller": label, "episode": i} | rounded(row, 6))
     return rows
 
 
 def timed(args, folder):
     rows = []
-    for label, iterations in (("N = 5", 5), ("N = 5", 3), ("N = 1", 3)):
-        python, c = exported(folder / f"{label} {iterations}", 2, iterations=iterations, **CONFIGURED[label])
-        milliseconds, plant = [], c.plant
+    for label, iterations, flags in TIMED:
+        options = dict(iterations=iterations) | CONFIGURED[label]
+        c = exported(folder / f"{len(rows)}", 2, flags, **options)[1]
+        milliseconds, plant, label = [], c.plant, label + ", single" * (SINGLE in flags)
         for x, psi in tqdm(list(zip(*draws(plant, -(-args.steps // 100), args.seed))), disable=None):
             c.reset()
             for _ in range(100):
@@ -250,12 +250,17 @@ def room(args, folder):
         found = subprocess.run([place / "stack"], capture_output=True, text=True, check=True).stdout.split()
         row = {"controller": label, "memory": len(c.memory), "state": ctypes.sizeof(c.state)}
         row |= {"stack_init": int(found[0]), "stack_step": int(found[1])}
-        row |= {"m7_functions": "", "m7_loop": "", "m7_work": ""}
+        row |= dict.fromkeys(
+            ("m7_functions", "m7_loop", "m7_work", "m7_single_functions", "m7_single_work"), ""
+        )
         if shutil.which("arm-none-eabi-gcc"):
             (place / "work.c").write_text('#include "rl_mpc.c"\nwork_memory only_its_size;\n')
-            row["m7_functions"] = sections(place, "rl_mpc_functions.c", flags=f"{M7} -ffast-math")[0]
             row["m7_loop"] = sections(place, "rl_mpc.c", "tree_qp.c")[0]
-            row["m7_work"] = sections(place, "work.c")[1]
+            for kind, flags in (("m7", M7), ("m7_single", f"{M7} {SINGLE}")):
+                row[f"{kind}_functions"] = sections(
+                    place, "rl_mpc_functions.c", flags=f"{flags} -ffast-math"
+                )[0]
+                row[f"{kind}_work"] = sections(place, "work.c", flags=flags)[1]
         rows.append(row)
     return rows
 
@@ -301,10 +306,12 @@ def print_table(study, rows):
     if study == "draws":
         for label, mine in common.grouped(rows, "controller").items():
             near, outside = (column(mine, key) for key in ("time_near_goal", "time_outside_constraints"))
-            figures = [f"{np.quantile(v, q):.1f}" for v in (near, outside) for q in (0.5, 0.05, 0)]
+            near, outside = (
+                " ".join(f"{np.quantile(v, q):.1f}" for q in (0.5, 0.05, 0)) for v in (near, outside)
+            )
+            offset = np.quantile(column(mine, "ape_tail"), [0.5, 0.95]).round(2)
             print(
-                f"{label}: near goal median, 5th percentile, worst {', '.join(figures[:3])}; outside",
-                *figures[3:],
+                f"{label}: near goal, median, 5th percentile, worst: {near}; outside {outside}; offset {offset} %"
             )
         return
     for row in rows:

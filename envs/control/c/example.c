@@ -13,9 +13,9 @@
 static double now_ms(void) { return 1e3 * clock() / CLOCKS_PER_SEC; }
 
 int main(void) {
-  static const double start[] = RL_MPC_PLANT_START, goal[] = RL_MPC_PLANT_GOAL, psi[] = RL_MPC_PLANT_PSI;
+  static const rl_mpc_real start[] = RL_MPC_PLANT_START, goal[] = RL_MPC_PLANT_GOAL, psi[] = RL_MPC_PLANT_PSI;
   static const int measured[] = RL_MPC_PLANT_MEASURED;
-  double x[RL_MPC_NX], y[RL_MPC_NY], u[RL_MPC_NU], after[RL_MPC_NX], work[1 + rl_mpc_plant_SZ_W];
+  rl_mpc_real x[RL_MPC_NX], y[RL_MPC_NY], u[RL_MPC_NU], after[RL_MPC_NX], work[1 + rl_mpc_plant_SZ_W];
   casadi_int integers[1 + rl_mpc_plant_SZ_IW];
   rl_mpc_state state;
   rl_mpc_info info;
@@ -34,8 +34,8 @@ int main(void) {
     for (int i = 0; i < RL_MPC_NGOAL; i++) printf(",%g", goal[i]);
     for (int i = 0; i < RL_MPC_NU; i++) printf(",%g", u[i]);
     printf(",%d,%d,%g\n", info.rung, info.iterations, took);
-    const double *arg[rl_mpc_plant_SZ_ARG] = {x, u, psi}; /* here your actuators */
-    double *res[rl_mpc_plant_SZ_RES] = {after};
+    const rl_mpc_real *arg[rl_mpc_plant_SZ_ARG] = {x, u, psi}; /* here your actuators */
+    rl_mpc_real *res[rl_mpc_plant_SZ_RES] = {after};
     rl_mpc_plant(arg, res, integers, work, 0);
     for (int i = 0; i < RL_MPC_NX; i++) x[i] = after[i];
   }

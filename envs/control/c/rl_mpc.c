@@ -5,7 +5,6 @@
 
 #include "rl_mpc.h"
 
-#include <math.h>
 #include <stdint.h>
 #include <string.h>
 
@@ -24,18 +23,18 @@ enum { HORIZON = RL_MPC_HORIZON, SCENARIOS = RL_MPC_SCENARIOS, EDGES = RL_MPC_NO
 
 typedef struct { /* what a step needs, and nobody afterwards */
   tree_qp *qp;
-  double price[SOME(EDGES * 2 * ROWS)], change[PLAN], barrier; /* of the quadratic program: times the weight of a node */
-  double low[SOME(EDGES * ROWS)], high[SOME(EDGES * ROWS)], priced[SOME(EDGES * 2 * ROWS)];
-  double x[NX], start[SCENARIOS * NX], psi[SOME(SCENARIOS * NPSI)], goals[HORIZON * NGOAL]; /* the problem */
-  double disturbance[NX], mismatch[NX], u_before[NU];
-  double guess[PLAN], plan[PLAN], step[PLAN], u_low[PLAN], u_high[PLAN], moved[PLAN];
-  double cost, states[EDGES * NX], A[EDGES * NX * NX], B[EDGES * NX * NU], slope[EDGES * NX], hessian[EDGES * NX * NX];
+  real price[SOME(EDGES * 2 * ROWS)], change[PLAN], barrier; /* of the quadratic program: times the weight of a node */
+  real low[SOME(EDGES * ROWS)], high[SOME(EDGES * ROWS)], priced[SOME(EDGES * 2 * ROWS)];
+  real x[NX], start[SCENARIOS * NX], psi[SOME(SCENARIOS * NPSI)], goals[HORIZON * NGOAL]; /* the problem */
+  real disturbance[NX], mismatch[NX], u_before[NU];
+  real guess[PLAN], plan[PLAN], step[PLAN], u_low[PLAN], u_high[PLAN], moved[PLAN];
+  real cost, states[EDGES * NX], A[EDGES * NX * NX], B[EDGES * NX * NU], slope[EDGES * NX], hessian[EDGES * NX * NX];
 #if RL_MPC_NZ
-  double z[RL_MPC_NZ], P[RL_MPC_NZ * RL_MPC_NZ], changed[RL_MPC_NZ * RL_MPC_NZ], far[NY];
-  double axes[RL_MPC_NKNOWN * RL_MPC_NKNOWN];
+  real z[RL_MPC_NZ], P[RL_MPC_NZ * RL_MPC_NZ], changed[RL_MPC_NZ * RL_MPC_NZ], far[NY];
+  real axes[RL_MPC_NKNOWN * RL_MPC_NKNOWN];
 #endif
-  const double *arg[RL_MPC_SZ_ARG]; /* of the generated functions */
-  double *res[RL_MPC_SZ_RES], w[SOME(RL_MPC_SZ_W)];
+  const real *arg[RL_MPC_SZ_ARG]; /* of the generated functions */
+  real *res[RL_MPC_SZ_RES], w[SOME(RL_MPC_SZ_W)];
   casadi_int iw[SOME(RL_MPC_SZ_IW)];
 } work_memory;
 
@@ -45,9 +44,9 @@ static const tree_qp_shape shape = {RL_MPC_NODES, RL_MPC_INNER, NX,      NU,    
 
 enum { ALIGNMENT = 64, WORK = (sizeof(work_memory) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT };
 
-static double clip(double a, double low, double high) { return a < low ? low : a > high ? high : a; }
+static real clip(real a, real low, real high) { return a < low ? low : a > high ? high : a; }
 
-static int all_finite(const double *a, int n) {
+static int all_finite(const real *a, int n) {
   for (int i = 0; i < n; i++)
     if (!isfinite(a[i])) return 0;
   return 1;
@@ -76,7 +75,7 @@ int rl_mpc_init(rl_mpc_state *self, void *memory, size_t size) {
   return rl_mpc_reset(self, NULL);
 }
 
-int rl_mpc_reset(rl_mpc_state *self, const double *u) {
+int rl_mpc_reset(rl_mpc_state *self, const real *u) {
   if (!self || !self->work) return RL_MPC_NOT_READY;
   if (u && !all_finite(u, NU)) return RL_MPC_NOT_FINITE;
   self->begun = self->planned = 0;
@@ -97,7 +96,7 @@ int rl_mpc_reset(rl_mpc_state *self, const double *u) {
 enum { NZ = RL_MPC_NZ, NKNOWN = RL_MPC_NKNOWN };
 
 /* the middle of the boxes, and what is measured as it is */
-static void begin(rl_mpc_state *self, const double *y, const double *present) {
+static void begin(rl_mpc_state *self, const real *y, const real *present) {
   memset(self->z, 0, sizeof self->z);
   memset(self->P, 0, sizeof self->P);
   for (int i = 0; i < NZ; i++) self->P[NZ * i + i] = prior[i];
@@ -107,8 +106,8 @@ static void begin(rl_mpc_state *self, const double *y, const double *present) {
 }
 
 /* takes an action and the measurement after it; wrong: which entries of that are */
-static void predict_and_correct(rl_mpc_state *self, work_memory *work, const double *y, const double *present, int *wrong) {
-  double u[NU], before[NY];
+static void predict_and_correct(rl_mpc_state *self, work_memory *work, const real *y, const real *present, int *wrong) {
+  real u[NU], before[NY];
   for (int k = 0; k < NU; k++) u[k] = (self->u[k] - u_center[k]) / u_scale[k];
   for (int i = 0; i < NY; i++) before[i] = self->wrong_for[i] >= RL_MPC_PATIENCE - 1;
   work->arg[0] = self->z, work->arg[1] = self->P, work->arg[2] = u;
@@ -122,11 +121,11 @@ static void predict_and_correct(rl_mpc_state *self, work_memory *work, const dou
   for (int i = 0; i < NY; i++) wrong[i] = wrong[i] || !(work->far[i] < RL_MPC_GATE);
 }
 
-static void estimate(rl_mpc_state *self, work_memory *work, const double *measurement, rl_mpc_info *info) {
-  double y[NY], present[NY];
+static void estimate(rl_mpc_state *self, work_memory *work, const real *measurement, rl_mpc_info *info) {
+  real y[NY], present[NY];
   int wrong[NY], any = 0, least = RL_MPC_LONGEST, most = 0;
   for (int i = 0; i < NY; i++) {
-    const double value = measurement[i];
+    const real value = measurement[i];
     present[i] = isfinite(value) && obs_low[measured[i]] <= value && value <= obs_high[measured[i]] && value != self->last[i];
     self->last[i] = value;
     y[i] = clip(((present[i] ? value : 0) - x_center[measured[i]]) / x_scale[measured[i]], -1e12, 1e12);
@@ -161,14 +160,14 @@ static void belief(rl_mpc_state *self, work_memory *work) {
   work->arg[0] = self->P, work->res[0] = work->axes;
   rl_mpc_axes(work->arg, work->res, work->iw, work->w, 0);
   const int most = (SCENARIOS - 1) / 2, pairs = most < NKNOWN ? most : NKNOWN, middle = SCENARIOS - 2 * pairs;
-  const double longer = sqrt(SCENARIOS / 2.0);
+  const real longer = sqrt(SCENARIOS / 2.0);
   for (int s = 0; s < SCENARIOS; s++) {
-    double z[NKNOWN], *psi = work->psi + NPSI * s;
-    const double *axis = work->axes + NKNOWN * (s < middle + pairs ? s - middle : s - middle - pairs);
-    const double sign = s < middle ? 0 : s < middle + pairs ? 1 : -1;
+    real z[NKNOWN], *psi = work->psi + NPSI * s;
+    const real *axis = work->axes + NKNOWN * (s < middle + pairs ? s - middle : s - middle - pairs);
+    const real sign = s < middle ? 0 : s < middle + pairs ? 1 : -1;
     for (int i = 0; i < NKNOWN; i++) z[i] = sign != 0 ? self->z[i] + sign * (axis[i] * longer) : self->z[i];
     for (int i = 0; i < NX; i++) {
-      const double x = clip(z[i] * x_scale[i] + x_center[i], obs_low[i], obs_high[i]);
+      const real x = clip(z[i] * x_scale[i] + x_center[i], obs_low[i], obs_high[i]);
       work->start[NX * s + i] = (x - x_center[i]) / x_scale[i];
     }
     memcpy(psi, psi_nominal, sizeof psi_nominal);
@@ -185,7 +184,7 @@ static void belief(rl_mpc_state *self, work_memory *work) {
 
 #else /* the state is measured */
 
-static void estimate(rl_mpc_state *self, work_memory *work, const double *measurement, rl_mpc_info *info) {
+static void estimate(rl_mpc_state *self, work_memory *work, const real *measurement, rl_mpc_info *info) {
   (void)self;
   memcpy(work->x, measurement, sizeof work->x);
   info->rejected = 0, info->restarted = 0;
@@ -201,14 +200,14 @@ static void belief(rl_mpc_state *self, work_memory *work) {
 
 /* Planning */
 
-static void give_problem(work_memory *work, const double *plan) {
-  const double *given[] = {work->start,    work->psi,   weight,        work->goals,    work->disturbance,
+static void give_problem(work_memory *work, const real *plan) {
+  const real *given[] = {work->start,    work->psi,   weight,        work->goals,    work->disturbance,
                            work->mismatch, slack_price, change_weight, work->u_before, plan};
   memcpy(work->arg, given, sizeof given);
 }
 
 /* not a number if a state of the plan is not finite */
-static double cost_of(work_memory *work, const double *plan) {
+static real cost_of(work_memory *work, const real *plan) {
   give_problem(work, plan);
   work->res[0] = &work->cost, work->res[1] = work->states;
   rl_mpc_rollout(work->arg, work->res, work->iw, work->w, 0);
@@ -217,7 +216,7 @@ static double cost_of(work_memory *work, const double *plan) {
 
 /* keeps work->guess as the plan if it is the cheapest so far */
 static void compare(work_memory *work, int guess, rl_mpc_info *info) {
-  const double cost = cost_of(work, work->guess);
+  const real cost = cost_of(work, work->guess);
   if (isfinite(cost) && (info->guess == RL_MPC_NONE || cost < info->cost)) {
     info->guess = guess, info->cost = cost;
     memcpy(work->plan, work->guess, sizeof work->plan);
@@ -227,8 +226,8 @@ static void compare(work_memory *work, int guess, rl_mpc_info *info) {
 static void first_guesses(rl_mpc_state *self, work_memory *work, rl_mpc_info *info) {
   info->guess = RL_MPC_NONE;
   if (self->planned) {
-    double distance = 0;
-    for (int i = 0; i < RL_MPC_INNER; i++) memcpy(work->guess + NU * i, self->plan + NU * later[i], NU * sizeof(double));
+    real distance = 0;
+    for (int i = 0; i < RL_MPC_INNER; i++) memcpy(work->guess + NU * i, self->plan + NU * later[i], NU * sizeof(real));
     compare(work, RL_MPC_SHIFTED, info);
     for (int i = 0; i < NX; i++) distance = fmax(distance, fabs((work->x[i] - self->x[i]) / x_scale[i]));
     if (distance < RL_MPC_HARDLY_MOVED) { /* where things move, an action that is planned for later would be put off for ever */
@@ -248,8 +247,8 @@ static void first_guesses(rl_mpc_state *self, work_memory *work, rl_mpc_info *in
 }
 
 /* the step to the minimum of the quadratic program about work->plan, and by how much it lowers the cost; 0 if it is not found */
-static int quadratic_program(work_memory *work, double *predicted) {
-  double slack_below = 0, slack_above = 0, found;
+static int quadratic_program(work_memory *work, real *predicted) {
+  real slack_below = 0, slack_above = 0, found;
   int counted;
   give_problem(work, work->plan);
   work->res[0] = work->states, work->res[1] = work->A, work->res[2] = work->B, work->res[3] = work->slope, work->res[4] = work->hessian;
@@ -259,7 +258,7 @@ static int quadratic_program(work_memory *work, double *predicted) {
     for (int k = 0; k < NX * NX; k++) work->hessian[NX * NX * e + k] *= weight[e + 1];
     for (int j = 0; j < ROWS; j++) {
       const int at = ROWS * e + j, below = 2 * ROWS * e + j, above = below + ROWS;
-      const double x = work->states[NX * e + row[j]], low = x_low[j] - x, high = x_high[j] - x;
+      const real x = work->states[NX * e + row[j]], low = x_low[j] - x, high = x_high[j] - x;
       slack_below += work->price[below] * fmax(low, 0);
       slack_above += work->price[above] * fmax(-high, 0);
       /* where there is no bound one out of reach, at the other's price */
@@ -291,17 +290,17 @@ static void improve(rl_mpc_state *self, work_memory *work, double began, rl_mpc_
       return;
     }
     info->iterations++;
-    double predicted;
+    real predicted;
     if (!quadratic_program(work, &predicted)) {
       info->stop = RL_MPC_UNSOLVED;
       return;
     }
     info->predicted = predicted;
-    const double tolerance = RL_MPC_TOLERANCE * fabs(info->cost), before = info->cost;
-    double share = 1;
+    const real tolerance = RL_MPC_TOLERANCE * fabs(info->cost), before = info->cost;
+    real share = 1;
     for (int halvings = 0; halvings < (predicted > tolerance ? RL_MPC_SHARES : 1); halvings++, share /= 2) {
       for (int k = 0; k < PLAN; k++) work->guess[k] = clip(work->plan[k] + share * work->step[k], -1, 1);
-      const double cost = cost_of(work, work->guess);
+      const real cost = cost_of(work, work->guess);
       if (cost < before && !(before - cost < 0.1 * share * predicted)) {
         memcpy(work->plan, work->guess, sizeof work->plan);
         info->cost = cost;
@@ -317,9 +316,9 @@ static void improve(rl_mpc_state *self, work_memory *work, double began, rl_mpc_
 }
 
 /* the action of the plan, else of the policy, else not a number */
-static void act(rl_mpc_state *self, work_memory *work, const double *goal, double began, double *u, rl_mpc_info *info) {
+static void act(rl_mpc_state *self, work_memory *work, const real *goal, double began, real *u, rl_mpc_info *info) {
   belief(self, work);
-  for (int t = 0; t < HORIZON; t++) memcpy(work->goals + NGOAL * t, goal, sizeof(double) * NGOAL);
+  for (int t = 0; t < HORIZON; t++) memcpy(work->goals + NGOAL * t, goal, sizeof(real) * NGOAL);
   for (int k = 0; k < NU; k++) work->u_before[k] = (self->u[k] - u_center[k]) / u_scale[k];
   first_guesses(self, work, info);
   self->planned = info->guess != RL_MPC_NONE;
@@ -339,7 +338,7 @@ static void act(rl_mpc_state *self, work_memory *work, const double *goal, doubl
 #endif
 }
 
-int rl_mpc_step(rl_mpc_state *self, const double *y, const double *goal, double *u, rl_mpc_info *info) {
+int rl_mpc_step(rl_mpc_state *self, const real *y, const real *goal, real *u, rl_mpc_info *info) {
   rl_mpc_info unwanted;
   if (!self || !self->work || !y || !goal || !u) return RL_MPC_NOT_READY;
   work_memory *work = self->work;
@@ -353,8 +352,8 @@ int rl_mpc_step(rl_mpc_state *self, const double *y, const double *goal, double 
 #if !RL_MPC_NZ
   if (!all_finite(y, NY)) return RL_MPC_NOT_FINITE;
 #endif
-  double near[NY], action[NU]; /* angles to the turn nearest to the last */
-  const double turn = 6.283185307179586;
+  real near[NY], action[NU]; /* angles to the turn nearest to the last */
+  const real turn = 6.283185307179586;
   for (int i = 0; i < NY; i++) {
     near[i] = turns[i] && isfinite(y[i]) ? fmod(y[i], turn) : y[i];
     if (turns[i] && self->begun) near[i] += turn * rint((self->x[measured[i]] - near[i]) / turn);

@@ -9,6 +9,13 @@
 
 #include <stddef.h>
 
+/* Everything that is compiled with RL_MPC_SINGLE computes in single precision. */
+#ifdef RL_MPC_SINGLE
+typedef float rl_mpc_real;
+#else
+typedef double rl_mpc_real;
+#endif
+
 $sizes
 
 $limits
@@ -41,8 +48,8 @@ enum { RL_MPC_STATIONARY, RL_MPC_LIMIT, RL_MPC_LATE, RL_MPC_UNSOLVED, RL_MPC_STA
 typedef struct {
   int rung, guess, stop; /* the enumerations above; guess and what follows only where rung is RL_MPC_PLAN */
   int iterations;
-  double guess_cost, cost; /* of the first guess and of the plan, never more */
-  double predicted;        /* by how much the last quadratic program meant to lower the cost */
+  rl_mpc_real guess_cost, cost; /* of the first guess and of the plan, never more */
+  rl_mpc_real predicted;        /* by how much the last quadratic program meant to lower the cost */
   unsigned rejected;       /* bit i: measurement i was missing or wrong, and left out (from 31 on together) */
   int restarted;           /* whether the filter has started again */
 } rl_mpc_info;
@@ -50,18 +57,18 @@ typedef struct {
 /* What the controller remembers from step to step. To save and restore it, copy everything above `iterations`. */
 typedef struct {
   int begun, planned;                  /* whether there has been a step, and whether it left a plan */
-  double x[RL_MPC_NX], u[RL_MPC_NU];   /* last state, measured or estimated, and last action */
-  double plan[RL_MPC_INNER * RL_MPC_NU]; /* actions of the nodes that have children, on a scale from -1 to 1 */
+  rl_mpc_real x[RL_MPC_NX], u[RL_MPC_NU];   /* last state, measured or estimated, and last action */
+  rl_mpc_real plan[RL_MPC_INNER * RL_MPC_NU]; /* actions of the nodes that have children, on a scale from -1 to 1 */
 #if RL_MPC_NZ                            /* the filter */
   int known;                             /* whether it has begun */
-  double z[RL_MPC_NZ], P[RL_MPC_NZ * RL_MPC_NZ]; /* state, parameters, disturbances; scaled; and their covariance */
-  double last[RL_MPC_NY];                        /* measurement */
+  rl_mpc_real z[RL_MPC_NZ], P[RL_MPC_NZ * RL_MPC_NZ]; /* state, parameters, disturbances; scaled; and their covariance */
+  rl_mpc_real last[RL_MPC_NY];                        /* measurement */
   int wrong_for[RL_MPC_NY];                      /* steps */
 #endif
   /* settings, which may be changed before every step */
   int iterations;         /* the most in a step; rl_mpc_init: RL_MPC_ITERATIONS */
-  double deadline_ms;     /* no iteration begins later than this after the step began; rl_mpc_init: RL_MPC_DEADLINE_MS */
-  double (*now_ms)(void); /* a clock for it, milliseconds from any origin; NULL: no deadline */
+  double deadline_ms;          /* no iteration begins later than this after the step began; rl_mpc_init: RL_MPC_DEADLINE_MS */
+  double (*now_ms)(void);      /* a clock for it, milliseconds from any origin; NULL: no deadline */
   void *work;             /* set by rl_mpc_init */
 } rl_mpc_state;
 
@@ -72,9 +79,9 @@ size_t rl_mpc_size(void);
 int rl_mpc_init(rl_mpc_state *state, void *memory, size_t size);
 
 /* Forgets everything, as at the start of an episode. u: the action that the plant gets now; NULL: 0. */
-int rl_mpc_reset(rl_mpc_state *state, const double *u);
+int rl_mpc_reset(rl_mpc_state *state, const rl_mpc_real *u);
 
 /* The action u for the measurement y, always finite and within its limits. info may be NULL. */
-int rl_mpc_step(rl_mpc_state *state, const double *y, const double *goal, double *u, rl_mpc_info *info);
+int rl_mpc_step(rl_mpc_state *state, const rl_mpc_real *y, const rl_mpc_real *goal, rl_mpc_real *u, rl_mpc_info *info);
 
 #endif

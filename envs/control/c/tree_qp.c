@@ -9,29 +9,40 @@
 
 #include "tree_qp.h"
 
-#include <math.h>
 #include <stdint.h>
 #include <string.h>
 
+#include <hpipm_tree.h>
+#ifdef RL_MPC_SINGLE
+#include <hpipm_s_tree_ocp_qp.h>
+#include <hpipm_s_tree_ocp_qp_dim.h>
+#include <hpipm_s_tree_ocp_qp_ipm.h>
+#include <hpipm_s_tree_ocp_qp_sol.h>
+#define HPIPM(name) s_tree_ocp_qp##name
+#define RIDGE 1e-6f     /* on du, so that an action that no cost depends on has a solution */
+#define DIAGONAL 1e-12f /* share of squares off the diagonal of a matrix that counts as diagonal */
+#else
 #include <hpipm_d_tree_ocp_qp.h>
 #include <hpipm_d_tree_ocp_qp_dim.h>
 #include <hpipm_d_tree_ocp_qp_ipm.h>
 #include <hpipm_d_tree_ocp_qp_sol.h>
-#include <hpipm_tree.h>
+#define HPIPM(name) d_tree_ocp_qp##name
+#define RIDGE 1e-8
+#define DIAGONAL 1e-26
+#endif
 
-#define RIDGE 1e-8 /* on du, so that an action that no cost depends on has a solution */
 #define ALIGNMENT 64
 #define ARGUMENTS 256 /* bytes that HPIPM's arguments may take; none at present */
 
 struct tree_qp {
   tree_qp_shape shape;
   struct tree tree;
-  struct d_tree_ocp_qp_dim dim;
-  struct d_tree_ocp_qp qp;
-  struct d_tree_ocp_qp_sol sol;
-  struct d_tree_ocp_qp_ipm_arg arg;
-  struct d_tree_ocp_qp_ipm_ws ws;
-  double *scratch, *positive, *dx; /* (H)+ and dx of every edge */
+  struct HPIPM(_dim) dim;
+  struct HPIPM() qp;
+  struct HPIPM(_sol) sol;
+  struct HPIPM(_ipm_arg) arg;
+  struct HPIPM(_ipm_ws) ws;
+  real *scratch, *positive, *dx; /* (H)+ and dx of every edge */
   int *index;
 };
 
@@ -53,14 +64,14 @@ static int size(const tree_qp_shape *shape, int node) {
 static size_t description(size_t nodes) {
   uintptr_t at = 0;
   take(&at, nodes * sizeof(struct node)), take(&at, nodes * sizeof(int)), take(&at, 6 * nodes * sizeof(int));
-  take(&at, d_tree_ocp_qp_dim_memsize(nodes)), take(&at, ARGUMENTS);
+  take(&at, HPIPM(_dim_memsize)(nodes)), take(&at, ARGUMENTS);
   return at;
 }
 
 /* what HPIPM has to know before it can tell the size of the rest */
 static void describe(tree_qp *self, uintptr_t memory) {
   tree_qp_shape *shape = &self->shape;
-  double *tolerance = &shape->tolerance;
+  real *tolerance = &shape->tolerance;
   const int n = shape->nodes, inner = shape->inner, nu = shape->nu, rows = shape->rows;
   struct node *node = take(&memory, n * sizeof *node);
   int *kids = take(&memory, n * sizeof *kids), *number = take(&memory, 6 * n * sizeof *number), at = 0;
@@ -73,27 +84,27 @@ static void describe(tree_qp *self, uintptr_t memory) {
     for (int k = 0; k < 6; k++) number[k * n + i] = of[k]; /* states, actions, bounds on each, general ones, slacks */
   }
   self->tree.root = node, self->tree.kids = kids, self->tree.Nn = n;
-  d_tree_ocp_qp_dim_create(n, &self->dim, take(&memory, d_tree_ocp_qp_dim_memsize(n)));
-  d_tree_ocp_qp_dim_set_all(&self->tree, number, number + n, number + 2 * n, number + 3 * n, number + 4 * n, number + 5 * n, &self->dim);
-  d_tree_ocp_qp_ipm_arg_create(&self->dim, &self->arg, take(&memory, ARGUMENTS));
-  d_tree_ocp_qp_ipm_arg_set_default(SPEED_ABS, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_iter_max(&shape->most, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_stat(tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_eq(tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_ineq(tolerance, &self->arg);
-  d_tree_ocp_qp_ipm_arg_set_tol_comp(tolerance, &self->arg);
+  HPIPM(_dim_create)(n, &self->dim, take(&memory, HPIPM(_dim_memsize)(n)));
+  HPIPM(_dim_set_all)(&self->tree, number, number + n, number + 2 * n, number + 3 * n, number + 4 * n, number + 5 * n, &self->dim);
+  HPIPM(_ipm_arg_create)(&self->dim, &self->arg, take(&memory, ARGUMENTS));
+  HPIPM(_ipm_arg_set_default)(SPEED_ABS, &self->arg);
+  HPIPM(_ipm_arg_set_iter_max)(&shape->most, &self->arg);
+  HPIPM(_ipm_arg_set_tol_stat)(tolerance, &self->arg);
+  HPIPM(_ipm_arg_set_tol_eq)(tolerance, &self->arg);
+  HPIPM(_ipm_arg_set_tol_ineq)(tolerance, &self->arg);
+  HPIPM(_ipm_arg_set_tol_comp)(tolerance, &self->arg);
 }
 
 /* where everything is, and the end of it */
 static uintptr_t arrange(tree_qp *self, uintptr_t memory, void **qp, void **sol, void **ws) {
   const tree_qp_shape *shape = &self->shape;
   const size_t nx = shape->nx, wide = nx + shape->nu;
-  *qp = take(&memory, d_tree_ocp_qp_memsize(&self->dim));
-  *sol = take(&memory, d_tree_ocp_qp_sol_memsize(&self->dim));
-  *ws = take(&memory, d_tree_ocp_qp_ipm_ws_memsize(&self->dim, &self->arg));
-  self->scratch = take(&memory, (4 * wide * wide + 8 * wide) * sizeof(double));
-  self->positive = take(&memory, shape->nodes * nx * nx * sizeof(double));
-  self->dx = take(&memory, shape->nodes * nx * sizeof(double));
+  *qp = take(&memory, HPIPM(_memsize)(&self->dim));
+  *sol = take(&memory, HPIPM(_sol_memsize)(&self->dim));
+  *ws = take(&memory, HPIPM(_ipm_ws_memsize)(&self->dim, &self->arg));
+  self->scratch = take(&memory, (4 * wide * wide + 8 * wide) * sizeof(real));
+  self->positive = take(&memory, shape->nodes * nx * nx * sizeof(real));
+  self->dx = take(&memory, shape->nodes * nx * sizeof(real));
   self->index = take(&memory, 2 * wide * sizeof(int));
   return memory;
 }
@@ -114,57 +125,57 @@ tree_qp *tree_qp_init(void *memory, const tree_qp_shape *shape) {
   self->shape = *shape;
   describe(self, (uintptr_t)head);
   arrange(self, at, &qp, &sol, &ws);
-  d_tree_ocp_qp_create(&self->dim, &self->qp, qp);
-  d_tree_ocp_qp_sol_create(&self->dim, &self->sol, sol);
-  d_tree_ocp_qp_ipm_ws_create(&self->dim, &self->arg, &self->ws, ws);
+  HPIPM(_create)(&self->dim, &self->qp, qp);
+  HPIPM(_sol_create)(&self->dim, &self->sol, sol);
+  HPIPM(_ipm_ws_create)(&self->dim, &self->arg, &self->ws, ws);
   /* what never changes: which variables have bounds and slacks, and that slack has no quadratic price */
   const int wide = shape->nx + shape->nu, rows = shape->rows;
   int *index = self->index, *soft = index + wide;
   for (int i = 0; i < wide; i++) index[i] = i;
   for (int i = 0; i < shape->nodes; i++) {
     if (i < shape->inner) {
-      d_tree_ocp_qp_set_idxbu(i, index, &self->qp);
-      if (i) d_tree_ocp_qp_set_S(i, self->scratch, &self->qp);
+      HPIPM(_set_idxbu)(i, index, &self->qp);
+      if (i) HPIPM(_set_S)(i, self->scratch, &self->qp);
     }
     if (i) {
       for (int j = 0; j < rows; j++) soft[j] = (i < shape->inner ? shape->nu : 0) + j;
-      d_tree_ocp_qp_set_b(i - 1, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_idxbx(i, (int *)shape->row, &self->qp);
-      d_tree_ocp_qp_set_idxs(i, soft, &self->qp);
-      d_tree_ocp_qp_set_Zl(i, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_Zu(i, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_lls(i, self->scratch, &self->qp);
-      d_tree_ocp_qp_set_lus(i, self->scratch, &self->qp);
+      HPIPM(_set_b)(i - 1, self->scratch, &self->qp);
+      HPIPM(_set_idxbx)(i, (int *)shape->row, &self->qp);
+      HPIPM(_set_idxs)(i, soft, &self->qp);
+      HPIPM(_set_Zl)(i, self->scratch, &self->qp);
+      HPIPM(_set_Zu)(i, self->scratch, &self->qp);
+      HPIPM(_set_lls)(i, self->scratch, &self->qp);
+      HPIPM(_set_lus)(i, self->scratch, &self->qp);
     }
   }
   return self;
 }
 
 /* by cyclic Jacobi rotations (Golub and Van Loan, section 8.5) */
-void tree_qp_positive_part(int n, const double *h, double *result, double *work) {
-  double *m = work, *v = work + n * n, total = 0;
+void tree_qp_positive_part(int n, const real *h, real *result, real *work) {
+  real *m = work, *v = work + n * n, total = 0;
   for (int i = 0; i < n * n; i++) {
     m[i] = (h[i] + h[i % n * n + i / n]) / 2;
     v[i] = i % n == i / n;
     total += m[i] * m[i];
   }
   for (int sweep = 0; sweep < 30; sweep++) {
-    double off = 0;
+    real off = 0;
     for (int q = 1; q < n; q++)
       for (int p = 0; p < q; p++) off += m[q * n + p] * m[q * n + p];
-    if (!(off > 1e-26 * total)) break;
+    if (!(off > DIAGONAL * total)) break;
     for (int q = 1; q < n; q++)
       for (int p = 0; p < q; p++) {
         if (m[q * n + p] == 0) continue;
-        const double theta = (m[q * n + q] - m[p * n + p]) / (2 * m[q * n + p]);
-        const double t = (theta >= 0 ? 1 : -1) / (fabs(theta) + sqrt(theta * theta + 1)), c = 1 / sqrt(t * t + 1), s = t * c;
+        const real theta = (m[q * n + q] - m[p * n + p]) / (2 * m[q * n + p]);
+        const real t = (theta >= 0 ? 1 : -1) / (fabs(theta) + sqrt(theta * theta + 1)), c = 1 / sqrt(t * t + 1), s = t * c;
         for (int k = 0; k < n; k++) { /* columns p and q of m and v */
-          const double a = m[p * n + k], b = m[q * n + k], d = v[p * n + k], e = v[q * n + k];
+          const real a = m[p * n + k], b = m[q * n + k], d = v[p * n + k], e = v[q * n + k];
           m[p * n + k] = c * a - s * b, m[q * n + k] = s * a + c * b;
           v[p * n + k] = c * d - s * e, v[q * n + k] = s * d + c * e;
         }
         for (int k = 0; k < n; k++) { /* rows p and q of m */
-          const double a = m[k * n + p], b = m[k * n + q];
+          const real a = m[k * n + p], b = m[k * n + q];
           m[k * n + p] = c * a - s * b, m[k * n + q] = s * a + c * b;
         }
       }
@@ -178,27 +189,27 @@ void tree_qp_positive_part(int n, const double *h, double *result, double *work)
 }
 
 /* a, (rows, columns), in the upper left corner of zeros; a itself where nothing is added */
-static double *widened(const double *a, int rows, int columns, int all_rows, int all_columns, double *scratch) {
-  if (rows == all_rows && columns == all_columns) return (double *)a;
+static real *widened(const real *a, int rows, int columns, int all_rows, int all_columns, real *scratch) {
+  if (rows == all_rows && columns == all_columns) return (real *)a;
   memset(scratch, 0, all_rows * all_columns * sizeof *scratch);
   for (int j = 0; j < columns; j++) memcpy(scratch + j * all_rows, a + j * rows, rows * sizeof *scratch);
   return scratch;
 }
 
 /* what is minimised, at du */
-static double cost_at(tree_qp *self, const double *du, const double *A, const double *B, const double *q, const double *x_low,
-                      const double *x_high, const double *price, const double *c, const double *moved) {
+static real cost_at(tree_qp *self, const real *du, const real *A, const real *B, const real *q, const real *x_low,
+                      const real *x_high, const real *price, const real *c, const real *moved) {
   const int nx = self->shape.nx, nu = self->shape.nu, rows = self->shape.rows;
-  double cost = 0;
+  real cost = 0;
   for (int i = 0; i < self->shape.inner; i++)
     for (int k = 0; k < nu; k++) {
-      const double step = du[nu * i + k] - (i ? du[nu * self->tree.root[i].dad + k] : 0);
+      const real step = du[nu * i + k] - (i ? du[nu * self->tree.root[i].dad + k] : 0);
       cost += c[nu * i + k] * (step + 2 * moved[nu * i + k]) * step;
     }
   for (int i = 1; i < self->shape.nodes; i++) {
     const int e = i - 1, dad = self->tree.root[i].dad;
-    const double *H = self->positive + nx * nx * e, *before = dad ? self->dx + nx * (dad - 1) : NULL;
-    double *x = self->dx + nx * e;
+    const real *H = self->positive + nx * nx * e, *before = dad ? self->dx + nx * (dad - 1) : NULL;
+    real *x = self->dx + nx * e;
     for (int j = 0; j < nx; j++) {
       x[j] = 0;
       for (int k = 0; before && k < nx; k++) x[j] += A[nx * nx * e + nx * k + j] * before[k];
@@ -209,59 +220,59 @@ static double cost_at(tree_qp *self, const double *du, const double *A, const do
       for (int k = 0; k < nx; k++) cost += H[nx * k + j] * x[j] * x[k] / 2;
     }
     for (int j = 0; j < rows; j++) {
-      const double at = x[self->shape.row[j]], *p = price + 2 * rows * e;
+      const real at = x[self->shape.row[j]], *p = price + 2 * rows * e;
       cost += p[j] * fmax(x_low[rows * e + j] - at, 0) + p[rows + j] * fmax(at - x_high[rows * e + j], 0);
     }
   }
   return cost;
 }
 
-int tree_qp_solve(tree_qp *self, const double *A, const double *B, const double *q, const double *H, const double *u_low,
-                  const double *u_high, const double *x_low, const double *x_high, const double *price, const double *c,
-                  const double *moved, double barrier, double *du, double *cost, int *iterations) {
+int tree_qp_solve(tree_qp *self, const real *A, const real *B, const real *q, const real *H, const real *u_low,
+                  const real *u_high, const real *x_low, const real *x_high, const real *price, const real *c,
+                  const real *moved, real barrier, real *du, real *cost, int *iterations) {
   const int nx = self->shape.nx, nu = self->shape.nu, rows = self->shape.rows, wide = nx + nu;
-  double *s = self->scratch, *work = s + wide * wide;
-  struct d_tree_ocp_qp *qp = &self->qp;
+  real *s = self->scratch, *work = s + wide * wide;
+  struct HPIPM() *qp = &self->qp;
   int status;
   for (int i = 0; i < self->shape.nodes; i++) {
     if (i < self->shape.inner) {
-      d_tree_ocp_qp_set_lbu(i, (double *)u_low + nu * i, qp);
-      d_tree_ocp_qp_set_ubu(i, (double *)u_high + nu * i, qp);
+      HPIPM(_set_lbu)(i, (real *)u_low + nu * i, qp);
+      HPIPM(_set_ubu)(i, (real *)u_high + nu * i, qp);
       memset(s, 0, nu * (nu + 1) * sizeof *s);
       for (int k = 0; k < nu; k++) s[k * nu + k] = RIDGE + 2 * c[nu * i + k], s[nu * nu + k] = 2 * c[nu * i + k] * moved[nu * i + k];
-      d_tree_ocp_qp_set_R(i, s, qp);
-      d_tree_ocp_qp_set_r(i, s + nu * nu, qp);
+      HPIPM(_set_R)(i, s, qp);
+      HPIPM(_set_r)(i, s + nu * nu, qp);
       if (i && self->shape.changes) {
         memset(s, 0, nu * wide * sizeof *s);
         for (int k = 0; k < nu; k++) s[(nx + k) * nu + k] = -2 * c[nu * i + k];
-        d_tree_ocp_qp_set_S(i, s, qp);
+        HPIPM(_set_S)(i, s, qp);
       }
     }
     if (i == 0) continue;
     const int e = i - 1, here = size(&self->shape, i), before = size(&self->shape, self->tree.root[i].dad);
-    if (before) d_tree_ocp_qp_set_A(e, widened(A + nx * nx * e, nx, nx, here, before, s), qp);
-    double *b = widened(B + nx * nu * e, nx, nu, here, nu, s);
+    if (before) HPIPM(_set_A)(e, widened(A + nx * nx * e, nx, nx, here, before, s), qp);
+    real *b = widened(B + nx * nu * e, nx, nu, here, nu, s);
     for (int k = 0; k < here - nx; k++) b[k * here + nx + k] = 1; /* the action is the next node's action before */
-    d_tree_ocp_qp_set_B(e, b, qp);
-    double *positive = self->positive + nx * nx * e;
+    HPIPM(_set_B)(e, b, qp);
+    real *positive = self->positive + nx * nx * e;
     tree_qp_positive_part(nx, H + nx * nx * e, positive, work);
-    double *Q = widened(positive, nx, nx, here, here, s);
+    real *Q = widened(positive, nx, nx, here, here, s);
     for (int k = 0; k < here - nx; k++) Q[(nx + k) * here + nx + k] = 2 * c[nu * i + k];
-    d_tree_ocp_qp_set_Q(i, Q, qp);
-    double *slope = widened(q + nx * e, nx, 1, here, 1, s);
+    HPIPM(_set_Q)(i, Q, qp);
+    real *slope = widened(q + nx * e, nx, 1, here, 1, s);
     for (int k = 0; k < here - nx; k++) slope[nx + k] = -2 * c[nu * i + k] * moved[nu * i + k];
-    d_tree_ocp_qp_set_q(i, slope, qp);
-    d_tree_ocp_qp_set_lbx(i, (double *)x_low + rows * e, qp);
-    d_tree_ocp_qp_set_ubx(i, (double *)x_high + rows * e, qp);
-    d_tree_ocp_qp_set_zl(i, (double *)price + 2 * rows * e, qp);
-    d_tree_ocp_qp_set_zu(i, (double *)price + 2 * rows * e + rows, qp);
+    HPIPM(_set_q)(i, slope, qp);
+    HPIPM(_set_lbx)(i, (real *)x_low + rows * e, qp);
+    HPIPM(_set_ubx)(i, (real *)x_high + rows * e, qp);
+    HPIPM(_set_zl)(i, (real *)price + 2 * rows * e, qp);
+    HPIPM(_set_zu)(i, (real *)price + 2 * rows * e + rows, qp);
   }
-  d_tree_ocp_qp_ipm_arg_set_mu0(&barrier, &self->arg);
-  d_tree_ocp_qp_ipm_solve(qp, &self->sol, &self->arg, &self->ws);
-  d_tree_ocp_qp_ipm_get_iter(&self->ws, iterations);
-  d_tree_ocp_qp_ipm_get_status(&self->ws, &status);
+  HPIPM(_ipm_arg_set_mu0)(&barrier, &self->arg);
+  HPIPM(_ipm_solve)(qp, &self->sol, &self->arg, &self->ws);
+  HPIPM(_ipm_get_iter)(&self->ws, iterations);
+  HPIPM(_ipm_get_status)(&self->ws, &status);
   for (int i = 0; i < self->shape.inner; i++) {
-    d_tree_ocp_qp_sol_get_u(i, &self->sol, du + nu * i);
+    HPIPM(_sol_get_u)(i, &self->sol, du + nu * i);
     for (int k = nu * i; k < nu * (i + 1); k++) du[k] = du[k] < u_low[k] ? u_low[k] : du[k] > u_high[k] ? u_high[k] : du[k];
   }
   *cost = cost_at(self, du, A, B, q, x_low, x_high, price, c, moved);

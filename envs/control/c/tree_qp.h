@@ -6,6 +6,8 @@
 
 #include <stddef.h>
 
+#include "real.h"
+
 typedef struct tree_qp tree_qp;
 
 /* A tree: parents come before their children, nodes with children before all others.
@@ -13,7 +15,7 @@ typedef struct tree_qp tree_qp;
 typedef struct {
   int nodes, inner, nx, nu, rows, changes; /* inner: nodes with children */
   const int *parent, *stage, *row;         /* they stay the caller's, and must stay */
-  double tolerance;                        /* of the interior point's residuals */
+  real tolerance;                          /* of the interior point's residuals */
   int most;                                /* iterations of it */
 } tree_qp_shape;
 
@@ -26,11 +28,11 @@ tree_qp *tree_qp_init(void *memory, const tree_qp_shape *shape);
 /* 0 if solved, HPIPM's status otherwise. Bounds are relative to the present plan; x_low, x_high: of the bounded states, price: (2, rows)
    per node, below and above; barrier: where the interior point starts, about the largest price. Finds du, the cost there, and how many
    iterations it took. */
-int tree_qp_solve(tree_qp *self, const double *A, const double *B, const double *q, const double *H, const double *u_low,
-                  const double *u_high, const double *x_low, const double *x_high, const double *price, const double *c,
-                  const double *moved, double barrier, double *du, double *cost, int *iterations);
+int tree_qp_solve(tree_qp *self, const real *A, const real *B, const real *q, const real *H, const real *u_low,
+                  const real *u_high, const real *x_low, const real *x_high, const real *price, const real *c,
+                  const real *moved, real barrier, real *du, real *cost, int *iterations);
 
 /* Projection of the symmetric part of h, (n, n), to positive semidefinite matrices; work: 2 n^2 numbers */
-void tree_qp_positive_part(int n, const double *h, double *result, double *work);
+void tree_qp_positive_part(int n, const real *h, real *result, real *work);
 
 #endif
