@@ -208,7 +208,7 @@ class ScenarioMPC(Controller):
 
     A plan is its actions, one per node that has children; the states follow by rolling the tree out. An iteration
     linearises the dynamics about the plan, replaces the Hessian of every node's cost by its positive part, solves
-    the tree's quadratic program (envs/control/tree_qp.c), and takes the largest share 1, 1/2, 1/4 ... of its step
+    the tree's quadratic program (envs/control/c/tree_qp.c), and takes the largest share 1, 1/2, 1/4 ... of its step
     that lowers the true cost by a tenth of what the program promised. So whenever it stops,
 
     - the plan satisfies the dynamics and the limits of the actions,

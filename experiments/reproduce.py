@@ -99,6 +99,7 @@ STEPS = [  # what others wait for and what takes long first
     study("training_speed", "speed/training_speed", "profile", 1, **TWO_CORES),
     study("training_speed", "speed/training_speed", "ablation", 20, ["training_speed_profile"], **TWO_CORES),
     study("training_speed", "speed/training_speed", "peer", 30, ["training_speed_ablation"], **TWO_CORES),
+    study("embedded", "speed/embedded", minutes=45, needs=CRITICS, alone=True, takes=()),
     study("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True, takes=RUNS),
 ]
 

@@ -106,9 +106,7 @@ def check_export_c(controller):
     if controller.estimator.mismatch_scale is not None:
         raise ValueError("--export-c cannot export a critic that observes the mismatch")
     if not isinstance(controller.qp, TreeQP):
-        raise ValueError(
-            "--export-c needs a C compiler here, and --compile: its check compares compiled code"
-        )
+        raise ValueError("--export-c needs a C compiler here, and --compile: its check is of compiled code")
 
 
 def snapshot(controller):
@@ -130,11 +128,11 @@ def recorded(controller, steps, seed=0, length=50, noise=0.0):
 
     Episodes of this length start at random; the first has the controller's goal, the others goals of their own.
     """
-    plant, goal, rows = controller.plant, controller.goal.copy(), []
+    plant, given, rows = controller.plant, controller.goal, []
     rng, episodes = np.random.default_rng([seed, 11]), -(-steps // length)
     for i, (x, psi) in enumerate(zip(*draws(plant, episodes, seed))):
         controller.reset()
-        controller.set_goal(rng.uniform(*plant.GOAL_REACHABLE) if i else goal)
+        controller.set_goal(rng.uniform(*plant.GOAL_REACHABLE) if i else controller.goals[:, 0])
         for _ in range(min(length, steps - i * length)):
             y = x[controller.estimator.measured]
             y = y + noise * rng.normal(size=y.shape) * envs.state_range(plant)[controller.estimator.measured]
@@ -143,7 +141,7 @@ def recorded(controller, steps, seed=0, length=50, noise=0.0):
             rows.append([*before, *y, *controller.goal, *u, controller.stats.get("cost", np.nan)])
             x = plant.step(x, u, psi)
     controller.reset()
-    controller.set_goal(goal)
+    controller.set_goal(given)
     return np.array(rows, dtype=float)
 
 
@@ -182,25 +180,22 @@ def interface(controller):
     sizes["DT"] = number(plant.DT), f"sampling time [{plant.TIME_UNIT}]"
     sizes["HORIZON"] = controller.horizon, "sampling times that a plan looks ahead"
     sizes["SCENARIOS"] = len(controller.scenarios), "versions of the model"
-    sizes["NODES"], sizes["INNER"] = (
-        (len(tree.parent), "of the scenario tree"),
-        (tree.inner, "that have children"),
-    )
+    sizes["NODES"] = len(tree.parent), "of the scenario tree"
+    sizes["INNER"] = tree.inner, "that have children"
     filtered = len(estimator.prior) if hasattr(estimator, "prior") else 0
     sizes["NZ"] = filtered, "numbers that the filter estimates; 0: there is none, the state is measured"
     sizes["ITERATIONS"] = controller.iterations, "the most per step"
     sizes["DEADLINE_MS"] = number(controller.deadline_ms or np.inf), "where there is a clock"
-    values = {"U_LOW": (plant.U_LOW, "limits of the actions, always kept"), "U_HIGH": (plant.U_HIGH, "")}
-    values |= {
+    limits = {
+        "U_LOW": (plant.U_LOW, "limits of the actions, always kept"),
+        "U_HIGH": (plant.U_HIGH, ""),
         "X_LOW": (plant.X_LOW, "limits of the states, which have a price"),
         "X_HIGH": (plant.X_HIGH, ""),
-    }
-    values |= {
-        "GOAL": (controller.goal, "the goal that was configured"),
+        "GOAL": (controller.goals[:, 0], "the goal that was configured"),
         "GOAL_LOW": (plant.GOAL_LOW, "the least"),
+        "GOAL_HIGH": (plant.GOAL_HIGH, "and the largest goal that is taken"),
     }
-    values |= {"GOAL_HIGH": (plant.GOAL_HIGH, "and the largest goal that is taken")}
-    return sizes, {name: (listed(value), comment) for name, (value, comment) in values.items()}
+    return sizes, {name: (listed(value), comment) for name, (value, comment) in limits.items()}
 
 
 def settings(controller, functions):
@@ -213,11 +208,8 @@ def settings(controller, functions):
     found |= {"SHARES": len(controller.SHARES), "HARDLY_MOVED": controller.HARDLY_MOVED}
     if isinstance(estimator, estimation.KalmanFilter):
         found |= {name: getattr(estimation, name) for name in ("PATIENCE", "GATE", "FURTHEST")}
-        found |= {
-            "LONGEST": estimator.longest,
-            "NKNOWN": estimator.known,
-            "POINTS": int(not estimator.certain),
-        }
+        found |= {"LONGEST": estimator.longest, "NKNOWN": estimator.known}
+        found |= {"POINTS": int(not estimator.certain)}
     sizes = {kind: max(getattr(f, f"sz_{kind}")() for f in functions) for kind in ("arg", "res", "iw", "w")}
     return found | {f"SZ_{kind.upper()}": size for kind, size in sizes.items()}
 
@@ -237,21 +229,16 @@ def code(controller):
     functions = [*controller.functions, *getattr(estimator, "functions", ())]
     if getattr(estimator, "certain", False):  # no sigma points
         functions = [f for f in functions if f.name() != "axes"]
-    data = [
-        '/* The numbers of this controller; rl_mpc.c says what they are. */\n\n#include "real.h"',
-        defined(settings(controller, functions)),
-    ]
-    data += ["\n".join(array(*item) for item in numbers(controller).items())]
+    data = '/* The numbers of this controller; rl_mpc.c says what they are. */\n\n#include "real.h"\n\n'
+    data += defined(settings(controller, functions)) + "\n\n"
+    data += "\n".join(array(*item) for item in numbers(controller).items()) + "\n"
     columns = ["time", *plant.STATE_NAMES, *(f"goal_{plant.STATE_NAMES[i]}" for i in plant.GOAL_INDEX)]
     columns += [*plant.ACTION_NAMES, "rung", "iterations", "ms"]
-    episode = {
-        "START": listed(plant.START),
-        "PSI": listed(plant.PSI_NOMINAL),
-        "GOAL": listed(controller.goal),
-    }
-    episode |= {"MEASURED": listed(estimator.measured), "COLUMNS": f'"{",".join(columns)}"'}
+    episode = {"START": listed(plant.START), "GOAL": listed(controller.goals[:, 0])}
+    episode |= {"PSI": listed(plant.PSI_NOMINAL), "MEASURED": listed(estimator.measured)}
+    episode |= {"COLUMNS": f'"{",".join(columns)}"'}
     files = {name: (C_SOURCES / name).read_text() for name in COPIED}
-    files |= {"rl_mpc_data.h": "\n\n".join(data) + "\n"} | code_files(functions, "rl_mpc_functions")
+    files |= {"rl_mpc_data.h": data} | code_files(functions, "rl_mpc_functions")
     files |= code_files([plant_function(plant)], "plant")
     files["plant.h"] += "\n" + defined({f"PLANT_{name}": value for name, value in episode.items()}) + "\n"
     return files
@@ -281,11 +268,12 @@ def export_c(controller, folder, records=100, noise=0.0):
     files, (sizes, limits) = code(controller), interface(controller)
     names = {name: sizes[name][1].partition(": ")[2] for name in ("NY", "NU", "NGOAL")}
     words = dict(title=f"Scenario MPC of {plant.ENV_ID}", dt=f"{plant.DT:g} {plant.TIME_UNIT}", wheel=WHEEL)
-    words |= dict(
-        actions=names["NU"], measurements=names["NY"], goals=names["NGOAL"], memory=0, records=records
-    )
+    words |= dict(actions=names["NU"], measurements=names["NY"], goals=names["NGOAL"], records=records)
     words |= dict(sizes=defined(sizes), limits=defined(limits), iterations=controller.iterations)
-    words["not_finite"] = "an action given to rl_mpc_reset" + " or a measurement" * (not filtered)
+    words["memory"], words["not_finite"] = (
+        0,
+        "an action given to rl_mpc_reset" + " or a measurement" * (not filtered),
+    )
 
     def fill(name):
         return Template((C_SOURCES / name).read_text()).substitute(words)
@@ -302,6 +290,4 @@ def export_c(controller, folder, records=100, noise=0.0):
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ValueError(f"--export-c {folder}: cannot write there ({error.strerror})") from None
-    print(
-        f"{folder}: {len(files)} files, README.md first; make -C {folder} builds them and repeats {len(rows)} steps"
-    )
+    print(f"{folder}: {len(files)} files, README.md first; make -C {folder} builds and checks them")
