@@ -48,7 +48,7 @@ from envs.control.export import export_c
 from envs.control.model import prediction_model, scaling
 from envs.control.tree_qp import ScenarioTree, tree_qp
 from envs.script.arguments import as_annotated, check_effects, check_ranges, check_weights
-from envs.script.comparison import draws, output_folder, parallel, run_episode, write_csv
+from envs.script.comparison import draws, output_folder, parallel, run_episode, table, write_csv
 from envs.script.figure import draw_episode
 
 # arguments that results.csv has columns for, or that change no result
@@ -77,19 +77,22 @@ class Args:
     """paired draws of start state and plant parameters"""
     steps: int = 100
     """sampling times per episode"""
+    starts: Literal["box", "start"] = "box"
+    """where the draws begin: anywhere in the plant's box of initial states, or near its start state"""
     seed: int = 0
     """seed of the draws"""
     jobs: int = 2
     """processes; the results do not depend on it, but for the times"""
 
-    robust_horizon: int = 1
-    """RL+MPC: stages at which the scenario tree branches; 0: one model, the nominal or the estimated one"""
+    robust_horizon: int | None = None
+    """RL+MPC: stages at which the scenario tree branches, 0: one model, the nominal or the estimated one; default: 1,
+    or what the checkpoint says"""
     sigma: float | None = None
-    """RL+MPC: width of the Gaussian stage cost, units of the goal; default: the plant's
+    """RL+MPC: width of the Gaussian stage cost, units of the goal; default: the plant's, or what the checkpoint says
     (cstr: 0.1 as in the paper's script; its text says 0.25)"""
     slack_weight: float | None = None
     """RL+MPC: price of a constraint violation, per physical unit (mol/l, degC) and step; default: 2 with a critic
-    that was trained with --constraint-weight, 1 with one that was not, as in the paper"""
+    that was trained with --constraint-weight, 1 with one that was not, as in the paper, or what it says"""
     constraints: Literal["soft", "hard"] = "soft"
     """RL+MPC: hard bounds are violated only where every plan violates them"""
     change_weight: tuple[float, ...] | None = None
@@ -137,8 +140,10 @@ class Critic:
         self.mismatch_scale = options.pop("observe_mismatch", None)  # of a critic that observes the mismatch
         self.plant = envs.load(data["env"], **options)
         self.goal_input, self.combine = data["goal_input"], combine
-        # the default price of violations in a plan that ends in this value
-        self.slack_weight = 2.0 if data["args"].get("constraint_weight") else 1.0
+        # what a plan that ends in this value does unless told otherwise
+        self.plan = dict(robust_horizon=1, sigma2=self.plant.MPC_SIGMA2, discount=1.0)
+        self.plan |= dict(slack_weight=2.0 if data["args"].get("constraint_weight") else 1.0)
+        self.plan |= data.get("plan", {})
         items = data["scaling"].items()  # affine maps between physical and network units
         self.scaling = {k: np.array(v, dtype=int if k.endswith("index") else float) for k, v in items}
         n_u, sizes = data["network"]["n_u"], [data["network"]["n_in"], *data["network"]["hidden"]]
@@ -155,7 +160,7 @@ class Critic:
         if not fit:
             raise ValueError("networks that do not fit")
         value = call(export(self)[2], self.plant.START, self.plant.EVAL_GOAL, np.zeros_like(self.plant.START))
-        if not np.isfinite(float(value)):
+        if not (np.isfinite(float(value)) and np.isfinite(list(self.plan.values())).all()):
             raise ValueError("values that are not finite")
 
     def features(self, x, goal):
@@ -222,6 +227,7 @@ class ScenarioMPC(Controller):
     scenarios: (S, n_psi), the first nominal. robust_horizon: stages at which the tree branches; 0: nominal.
     slack_price: scalar or (2, n_x), per physical unit below X_LOW and above X_HIGH; inf: `HARD_PRICE`; 0: no bound.
     change_weight: scalar or (n_u,), price of the squared change of each action, physical units.
+    discount: what a stage's cost counts less than the one before.
     policy: CasADi function like value, -> u (n_u,), or None. expansion: CasADi function (x, goal, mismatch) ->
     value, gradient, Hessian; default: CasADi's own derivatives. estimator: see `Controller`; its `belief` says
     where every scenario starts, with which parameters, and its weight.
@@ -247,6 +253,7 @@ class ScenarioMPC(Controller):
         robust_horizon=1,
         slack_price=1.0,
         change_weight=0.0,
+        discount=1.0,
         policy=None,
         expansion=None,
         estimator=None,
@@ -263,7 +270,7 @@ class ScenarioMPC(Controller):
         self.scenarios = scenarios if robust_horizon else scenarios[:1]
         self.horizon, self.tree = horizon, ScenarioTree(len(self.scenarios), horizon, robust_horizon)
         self.x_center, self.x_scale, self.u_center, self.u_scale = scaling(plant)
-        self.policy = policy
+        self.policy, self.discount = policy, discount
         # prices per scaled unit; states without a bound or a price are left out
         bounds = (np.array([plant.X_LOW, plant.X_HIGH]) - self.x_center) / self.x_scale
         active = np.isfinite(bounds) & (price > 0)
@@ -318,10 +325,10 @@ class ScenarioMPC(Controller):
         stage_model = ca.Function("stage_model", [x, g], [slope, hessian], named)
         violation = ca.horzcat(ca.fmax(self.low - x[rows], 0), ca.fmax(x[rows] - self.high, 0))
         slack = ca.Function("slack", [x, price], [ca.dot(price, violation)], named)
-        v = ca.MX(1, 1) if value is None else call(value, state, g, m)
+        v = ca.MX(1, 1) if value is None else self.discount * call(value, state, g, m)
         slope, hessian = ca.gradient(v, x), ca.hessian(v, x)[0]
         if expansion is not None:
-            _, slope, hessian = expansion(state, g, m)
+            _, slope, hessian = (self.discount * part for part in expansion(state, g, m))
             slope, hessian = slope * self.x_scale, hessian * np.outer(self.x_scale, self.x_scale)
         final = ca.Function("final", [x, g, m], [v], named)
         final_model = ca.Function("final_model", [x, g, m], [ca.densify(slope), ca.densify(hessian)], named)
@@ -364,11 +371,15 @@ class ScenarioMPC(Controller):
         super().reset(u)
         self.plan = self.problem = None  # scaled actions (inner, n_u), and what they were planned from
 
+    def weights(self, weight):
+        """What the cost of every node counts, from the weights of the scenarios (S,)."""
+        return self.tree.weights(weight) * self.discount ** np.maximum(self.tree.stage - 1, 0)
+
     def _problem(self, x):
         """Parameters of the compiled functions, a row per column of theirs."""
         starts, psi, weight = self.estimator.belief(self.scenarios)
         u_before = (self.u_before - self.u_center) / self.u_scale
-        known = (starts - self.x_center) / self.x_scale, psi, self.tree.weights(weight)[:, None], self.goals.T
+        known = (starts - self.x_center) / self.x_scale, psi, self.weights(weight)[:, None], self.goals.T
         known += self.estimator.disturbance, self.estimator.mismatch
         return *known, self.slack_price, self.change_weight, u_before
 
@@ -474,12 +485,15 @@ def build_controller(name, args):
         options |= dict(robust_horizon=int(robust))
         stage = ca.Function("stage", [x, g], [squared_error])
         return ScenarioMPC(plant, benchmark["horizon"], scenarios, stage, **options)
-    sigma2 = plant.MPC_SIGMA2 if args.sigma is None else args.sigma**2
+    plan = critic.plan
+    sigma2 = plan["sigma2"] if args.sigma is None else args.sigma**2
     stage = ca.Function("stage", [x, g], [plant.economic_cost(x, ca) - ca.exp(-squared_error / (2 * sigma2))])
-    slack_weight = critic.slack_weight if args.slack_weight is None else args.slack_weight
+    slack_weight = plan["slack_weight"] if args.slack_weight is None else args.slack_weight
     price = slack_weight if args.constraints == "soft" else np.inf
     change = args.change_weight or 0.0
-    options |= dict(robust_horizon=args.robust_horizon, slack_price=price, change_weight=change)
+    robust_horizon = plan["robust_horizon"] if args.robust_horizon is None else args.robust_horizon
+    options |= dict(robust_horizon=robust_horizon, slack_price=price, change_weight=change)
+    options |= dict(discount=plan["discount"])
     if name == "rl_mpc":
         options |= dict(value=V, policy=mu, expansion=expansion(critic))
     return ScenarioMPC(plant, args.horizon, scenarios, stage, **options)
@@ -513,7 +527,8 @@ def worker_controller(name, args):
 def run_job(name, args, episode):
     """A controller on a paired draw, or (None) from the plant's start: x, u and its row of results.csv."""
     controller, critic = worker_controller(name, args), critic_path(args)
-    plant, (starts, psis) = controller.plant, draws(controller.plant, (episode or 0) + 1, args.seed)
+    plant = controller.plant
+    starts, psis = draws(plant, (episode or 0) + 1, args.seed, args.starts)
     start, psi = (plant.START, plant.PSI_NOMINAL) if episode is None else (starts[episode], psis[episode])
     rng = np.random.default_rng([args.seed, 7, (episode or 0) + 1])
     x, u, row = run_episode(controller, plant, start, psi, controller.goal, args.steps, args.noise, rng)
@@ -534,29 +549,6 @@ def compare(args, names):
 
 def label(row):
     return LABELS[row["controller"]] + (f", N = {row['horizon']}" if row["controller"] != "actor" else "")
-
-
-TABLE = """\
-                        time near goal    time outside    offset     step, ms   iterations   late  steps that
-controller              median [worst]  median [worst]       %  median    p95     per step  steps   fell back
-{}
-Near the goal more is better; outside the constraints 0 is best, and from many a start out of reach for all.
-Offset: mean error of the last 25 steps. Late: stopped by --deadline-ms. Fell back: found no plan."""
-
-
-def table(rows):
-    """The comparison as text: median [worst] over episodes."""
-    lines = []
-    for name in dict.fromkeys(row["controller"] for row in rows):
-        mine = [row for row in rows if row["controller"] == name]
-        columns = (np.array([row[key] for row in mine]) for key in list(rows[0])[9:])
-        near, outside, offset, median, p95, iterations, late, fell_back = columns
-        lines.append(
-            f"{label(mine[0]):22s}  {np.median(near):6.1f} [{near.min():5.1f}]  {np.median(outside):6.1f}"
-            f" [{outside.min():5.1f}]  {np.median(offset):6.2f}  {np.median(median):6.1f} {np.median(p95):6.1f}"
-            f"  {iterations.mean():11.1f}  {late.sum():5d}  {fell_back.sum():10d}"
-        )
-    return TABLE.format("\n".join(lines))
 
 
 def check(args):
@@ -584,7 +576,8 @@ def check(args):
     if not args.controllers:
         raise ValueError(f"--controllers is empty; choose from {', '.join(LABELS)}")
     check_weights("change_weight", args.change_weight, len(plant.U_LOW))
-    ScenarioTree(len(envs.scenario_set(plant, "mpc")), max(args.horizon, 1), args.robust_horizon)
+    branching = critic.plan["robust_horizon"] if args.robust_horizon is None else args.robust_horizon
+    ScenarioTree(len(envs.scenario_set(plant, "mpc")), max(args.horizon, 1), branching)
     goal = envs.checked_goal(plant, plant.EVAL_GOAL if args.goal is None else args.goal)
     kind, certain = "ekf" if args.offset_free else args.estimator, args.offset_free or args.spread is not None
     options = dict(certain=certain, mismatch_scale=critic.mismatch_scale, compile=args.compile)
@@ -618,7 +611,7 @@ def main(args):
     shown = [name for name in names if name != "nominal_mpc"] or names
     lines = {label(found[name, None][2]): (*found[name, None][:2], STYLES[name]) for name in shown}
     draw_episode(plant, lines, np.tile(goal, (args.steps, 1)), out / "episode.png")
-    print(table(rows))
+    print(table(rows, label))
     print(
         f"{args.episodes} paired draws in {time.perf_counter() - tick:.0f} s; {out}/results.csv, trajectories.npz"
     )

@@ -120,6 +120,7 @@ def written_out(
     change=0.0,
     u_before=0.0,
     disturbance=0.0,
+    discount=1.0,
 ):
     """States and cost of a plan by the definition of the problem, node by node.
 
@@ -139,7 +140,7 @@ def written_out(
         assert u.shape[1] == len(level)
         following = []
         for j, (x, w, last, before) in enumerate(level):
-            cost += w * np.sum(change * (u[:, j] - before) ** 2)
+            cost += discount ** max(t - 1, 0) * w * np.sum(change * (u[:, j] - before) ** 2)
             for i in range(S) if t < robust_horizon else [last]:
                 share = w * (weight[i] if t < robust_horizon else 1.0)
                 after = (
@@ -147,9 +148,10 @@ def written_out(
                     + disturbance
                 )
                 below, above = np.maximum(plant.X_LOW - after, 0), np.maximum(after - plant.X_HIGH, 0)
-                cost += share * (stage(after, goal[:, t]) + price[0] @ below + price[1] @ above)
+                now = discount**t * share
+                cost += now * (stage(after, goal[:, t]) + price[0] @ below + price[1] @ above)
                 if value is not None and t == len(actions) - 1:
-                    cost -= share * value(after, goal[:, t])
+                    cost -= discount * now * value(after, goal[:, t])
                 following.append((after, share, i, u[:, j]))
         level = following
         states.append(np.stack([node[0] for node in level], axis=1))
@@ -849,6 +851,34 @@ def test_weighted_costs_add_up_and_scenarios_start_from_their_own_states(robust_
         np.testing.assert_allclose(mine, theirs, rtol=1e-9)
     if robust_horizon == 1:
         assert mixed == pytest.approx(sum(w * cost(one) for w, one in zip(weight, np.eye(3))), rel=1e-9)
+
+
+@pytest.mark.parametrize("robust_horizon", [0, 1, 2])
+def test_a_discount_counts_later_stages_and_the_value_less(robust_horizon):
+    """x_t by discount^(t - 1), the value by discount^N, as V(x_N) counts from x_{N+1} on; the optimum's slopes with them."""
+    psi, x = cstr.SCENARIOS["mpc"][[0, 4, 8]], ca.MX.sym("x", 4)
+    value = ca.Function("value", [x, ca.MX.sym("g")], [-((x[1] - 0.7) ** 2)])
+    options = dict(discount=0.8, value=value, robust_horizon=robust_horizon, change_weight=[1e-4, 1e-8])
+    controller = mpc(3, psi, iterations=1, **options)
+    controller.make_step(X0)
+    states, expected = written_out(
+        cstr,
+        controller.prediction()["u"],
+        np.tile(X0, (3, 1)),
+        psi,
+        np.full((1, 3), GOAL),
+        numpy_stage(cstr),
+        lambda x, g: -((x[1] - 0.7) ** 2),
+        robust_horizon=robust_horizon,
+        price=1.0,
+        change=np.array([1e-4, 1e-8]),
+        discount=0.8,
+    )
+    assert controller.stats["cost"] == pytest.approx(expected, rel=1e-9)
+    # a program with wrong slopes would not foresee what its step does
+    fine = mpc(3, psi, iterations=50, **options)
+    fine.make_step(X0)
+    assert fine.stats["stop"] == "stationary" and fine.stats["cost"] <= controller.stats["cost"]
 
 
 def test_a_disturbance_shifts_the_prediction_by_itself_at_the_first_stage():

@@ -155,7 +155,7 @@ def numbers(controller):
     found |= dict(u_low=plant.U_LOW, u_high=plant.U_HIGH, goal_low=plant.GOAL_LOW, goal_high=plant.GOAL_HIGH)
     found |= dict(measured=measured, turns=np.isin(measured, plant.ANGLES))
     found |= dict(parent=tree.parent, stage=tree.stage, later=tree.later, row=controller.rows)
-    found |= dict(weight=tree.weights(np.full(S, 1 / S)), scenarios=controller.scenarios)
+    found |= dict(weight=controller.weights(np.full(S, 1 / S)), scenarios=controller.scenarios)
     found |= dict(slack_price=controller.slack_price, change_weight=controller.change_weight)
     found |= dict(x_low=controller.low, x_high=controller.high)
     found |= dict(bounded_below=active[0], bounded_above=active[1])

@@ -13,13 +13,15 @@ from tqdm import tqdm
 import envs
 
 
-def draws(plant, episodes, seed):
-    """Start states (episodes, n_x) uniform in their box and plants (episodes, n_psi) from the evaluation set."""
-    rngs = [
-        np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)
-    ]  # of any number, the first are the same
-    starts = np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs])
-    return starts, np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
+def draws(plant, episodes, seed, starts="box"):
+    """Start states (episodes, n_x) uniform in their box or near the plant's START, and plants (episodes, n_psi) from the evaluation set."""
+    # of any number, the first are the same
+    rngs = [np.random.default_rng([seed, 3, i + 1]) for i in range(episodes)]
+    x = np.concatenate([envs.sample_states(plant, rng, 1) for rng in rngs])
+    psi = np.stack([rng.choice(plant.EVAL_PSI) for rng in rngs])
+    if starts == "start":
+        x = np.stack([plant.START + plant.START_NOISE * rng.uniform(-1, 1, len(plant.START)) for rng in rngs])
+    return x, psi
 
 
 def run_episode(controller, plant, x0, psi, goal, steps, noise=0.0, rng=None):
@@ -128,3 +130,26 @@ def write_csv(rows, path):
         writer.writeheader()
         writer.writerows(rows)
     path.with_suffix(".tmp").replace(path)
+
+
+TABLE = """\
+                        time near goal    time outside    offset     step, ms   iterations   late  steps that
+controller              median [worst]  median [worst]       %  median    p95     per step  steps   fell back
+{}
+Near the goal more is better; outside the constraints 0 is best, and from many a start out of reach for all.
+Offset: mean error of the last 25 steps. Late: stopped by --deadline-ms. Fell back: found no plan."""
+
+
+def table(rows, label):
+    """Rows of results.csv as text: median [worst] over episodes; label: the name of a row."""
+    lines = []
+    for name in dict.fromkeys(row["controller"] for row in rows):
+        mine = [row for row in rows if row["controller"] == name]
+        columns = (np.array([row[key] for row in mine]) for key in list(rows[0])[9:])
+        near, outside, offset, median, p95, iterations, late, fell_back = columns
+        lines.append(
+            f"{label(mine[0]):22s}  {np.median(near):6.1f} [{near.min():5.1f}]  {np.median(outside):6.1f}"
+            f" [{outside.min():5.1f}]  {np.median(offset):6.2f}  {np.median(median):6.1f} {np.median(p95):6.1f}"
+            f"  {iterations.mean():11.1f}  {late.sum():5d}  {fell_back.sum():10d}"
+        )
+    return TABLE.format("\n".join(lines))

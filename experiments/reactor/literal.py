@@ -230,9 +230,11 @@ def build_controller(name, args, kind=IpoptMPC, replaced=()):
     if name != "rl_mpc":
         raise ValueError(f"{name!r} is not a controller by IPOPT; choose nominal_mpc, robust_mpc or rl_mpc")
     mu, _, V = deploy.export(critic)
-    price = critic.slack_weight if args.slack_weight is None else args.slack_weight
+    price = critic.plan["slack_weight"] if args.slack_weight is None else args.slack_weight
     price = price if args.constraints == "soft" else np.inf
-    options |= dict(robust_horizon=args.robust_horizon, slack_price=price)
+    options |= dict(
+        robust_horizon=1 if args.robust_horizon is None else args.robust_horizon, slack_price=price
+    )
     # a shifted plan is often far from optimal under a learned value: the adaptive barrier takes fewer iterations there
     options |= dict(policy=mu, barrier="adaptive")
     return kind(plant, args.horizon, scenarios, gaussian(plant), negative(V), **options)

@@ -88,7 +88,7 @@ def value_mpc(settings, kind=deploy.ScenarioMPC, scenarios=None):
     """RL+MPC as by deploy.build_controller, of another class or with another scenario set (S, n_psi)."""
     plant, goal, critic, _ = deploy.check(settings)
     mu, _, V = deploy.export(critic)
-    price = critic.slack_weight if settings.slack_weight is None else settings.slack_weight
+    price = critic.plan["slack_weight"] if settings.slack_weight is None else settings.slack_weight
     options = dict(slack_price=price, iterations=settings.iterations, compile=settings.compile)
     options |= dict(goal=goal, policy=mu, expansion=expansion(critic))
     scenarios = plant.SCENARIOS["mpc"] if scenarios is None else scenarios
