@@ -341,7 +341,7 @@ class ScenarioMPC(Controller):
         last = ca.repmat(goal[:, -1], 1, leaves), ca.repmat(mismatch, 1, leaves)
         moved = u - ca.horzcat(u_before, u[:, tree.parent[1 : tree.inner].tolist()])
         (X,) = rolled_out(step, planned)
-        J = weight[1:] @ (stage.map(n)(X, goals) + slack.map(n)(X, prices)).T
+        J = weight[1:] @ (stage.map(n)(X, goals) + (slack.map(n)(X, prices) if rows else 0)).T
         J += weight[: tree.inner] @ (change.T @ moved**2).T
         J -= weight[-leaves:] @ final.map(leaves)(X[:, -leaves:], *last).T
         rollout = ca.Function("rollout", [*problem, u], [J, X])

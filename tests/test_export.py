@@ -1,6 +1,7 @@
 """The controller in C: its actions against Python's, whatever is measured, its memory and what it refuses."""
 
 import ctypes
+import os
 import re
 import shutil
 import subprocess
@@ -92,8 +93,20 @@ def test_without_a_value_and_a_policy(tmp_path):
     x, g = ca.MX.sym("x", 4), ca.MX.sym("g", 1)
     stage = ca.Function("stage", [x, g], [ca.sumsqr(x[1] - g)])
     mpc = deploy.ScenarioMPC(plant, 3, plant.SCENARIOS["mpc"][:2], stage, goal=0.6)
-    export_c(mpc, tmp_path, records=20)
-    assert "20 of 20 actions" in make(tmp_path)
+    export_c(mpc, tmp_path / "bounded", records=20)
+    assert "20 of 20 actions" in make(tmp_path / "bounded")
+    # nor bounds, nor uncertain parameters to speak of, with a goal per stage
+    mpc = deploy.ScenarioMPC(plant, 3, plant.PSI_NOMINAL[None], stage, goal=0.6, slack_price=0.0)
+    mpc.set_goal(np.full((1, 3), 0.6))
+    export_c(mpc, tmp_path / "free", records=20)
+    assert "20 of 20 actions" in make(tmp_path / "free", flags=f"{embedded.HERE} -Werror=int-conversion")
+    assert mpc.goal.shape == (1, 3)
+
+
+def test_a_deadline_of_the_command_line_does_not_reach_the_check(tmp_path):
+    deploy.main(deploy.Args(horizon=1, deadline_ms=1e-3, export_c=tmp_path))
+    assert "100 of 100 actions" in make(tmp_path)
+    assert "RL_MPC_DEADLINE_MS 0.001" in (tmp_path / "rl_mpc.h").read_text()
 
 
 def test_the_check_finds_what_differs(built, tmp_path):
@@ -114,9 +127,7 @@ def test_other_flags_round_otherwise_and_decide_alike(built, tmp_path, compiler)
         pytest.skip(f"no {compiler}")
     folder = shutil.copytree(built("the reactor")[0], tmp_path / "copy")
     make(folder, "clean")
-    assert re.match(
-        r"(99|100) of 100 actions", make(folder, compiler=compiler, flags="-O1", more=("FLAGS=",))
-    )
+    assert re.match(r"(99|100) of 100 actions", make(folder, compiler=compiler, flags="-O1", more=("FAST=",)))
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -131,10 +142,33 @@ def test_what_is_written_by_hand_is_plain_c99(built, name, compiler):
             subprocess.run(command, cwd=built(name)[0], check=True)
 
 
-def test_fast_math_is_refused_where_it_would_do_harm(built):
-    command = ["gcc", "-ffast-math", "-fsyntax-only", f"-I{WHEEL}/include", "rl_mpc.c"]
+@pytest.mark.parametrize("flag", ["-ffast-math", "-ffinite-math-only"])
+@pytest.mark.parametrize("source", ["rl_mpc.c", "tree_qp.c"])
+def test_fast_math_is_refused_where_it_would_do_harm(built, source, flag):
+    command = ["gcc", flag, "-fsyntax-only", f"-I{WHEEL}/include", source]
     out = subprocess.run(command, cwd=built("the reactor")[0], capture_output=True, text=True)
     assert out.returncode and "without -ffast-math" in out.stderr
+
+
+def test_flags_of_the_environment_do_not_reach_the_checks(built):
+    run = dict(capture_output=True, text=True, check=True)
+    for name in ("OWN", "FLAGS", "FAST"):
+        command = ["make", "-nB", "-C", built("the reactor")[0], "tree_qp.o", "rl_mpc.o"]
+        out = subprocess.run(command, env=os.environ | {name: "-ffast-math"}, **run).stdout
+        assert "-c tree_qp.c" in out and "-ffast-math" not in out
+
+
+def test_single_precision(built, tmp_path):
+    """Plans cost the same, and files of both kinds do not link."""
+    for name in ("the reactor", "noise, c_A unmeasured"):
+        folder = shutil.copytree(built(name)[0], tmp_path / name)
+        make(folder, "clean")
+        costs = re.search(r"(\d+) costs within 1 %", make(folder, flags=f"{embedded.HERE} {embedded.SINGLE}"))
+        assert int(costs[1]) >= 95
+    for name in ("check", "check.o"):
+        (folder / name).unlink()
+    with pytest.raises(RuntimeError, match="undefined reference"):
+        make(folder, "check")
 
 
 @pytest.mark.parametrize("name", ["noise, c_A unmeasured", "double_pendulum"])
@@ -241,6 +275,15 @@ def test_what_cannot_be_exported(tmp_path, options, said):
     with pytest.raises(ValueError, match=said):
         deploy.main(deploy.Args(**dict(export_c=tmp_path / "c") | options))
     assert not (tmp_path / "c").exists()
+
+
+def test_a_folder_with_other_files_is_left_alone_and_an_export_replaced(built, tmp_path):
+    (tmp_path / "README.md").write_text("precious")
+    with pytest.raises(ValueError, match="holds other files"):
+        deploy.main(deploy.Args(horizon=1, export_c=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+    folder, python, _ = built("the reactor")
+    export_c(python, folder, records=100)
 
 
 def test_a_critic_that_observes_the_mismatch_is_not_exported(tmp_path):

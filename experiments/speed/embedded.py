@@ -48,7 +48,7 @@ BUILDS = {  # label: (compiler, flags, arguments of make)
     "gcc, the flags of Python": ("gcc", HERE, ()),
     "gcc, not -fPIC": ("gcc", "-O3 -march=native", ()),
     "gcc -O2, any x86-64": ("gcc", "-O2", ()),
-    "gcc -O2, without fast-math": ("gcc", "-O2", ("FLAGS=",)),
+    "gcc -O2, without fast-math": ("gcc", "-O2", ("FAST=",)),
     "clang": ("clang", "-O3 -march=native", ()),
     "aarch64, gcc": ("aarch64-linux-gnu-gcc", "-O3", ()),
 }
@@ -103,16 +103,19 @@ class Exported:
         self.library = ctypes.CDLL(f"{folder}/librl_mpc.so")
         self.real, real = (np.float32, ctypes.c_float) if SINGLE in flags else (np.float64, ctypes.c_double)
         self.state, self.info = structures(folder, real)
-        self.library.rl_mpc_size.restype = ctypes.c_size_t
-        self.memory = ctypes.create_string_buffer(self.library.rl_mpc_size())
-        size = ctypes.c_size_t(len(self.memory))
-        assert self.library.rl_mpc_init(ctypes.byref(self.state), self.memory, size) == 0
+        names = (
+            f"rl_mpc_{name}" + "_single" * (SINGLE in flags) for name in ("size", "init", "reset", "step")
+        )
+        size, init, self.c_reset, self.c_step = (getattr(self.library, name) for name in names)
+        size.restype = ctypes.c_size_t
+        self.memory = ctypes.create_string_buffer(size())
+        assert init(ctypes.byref(self.state), self.memory, ctypes.c_size_t(len(self.memory))) == 0
         self.plant, self.estimator = controller.plant, SimpleNamespace(measured=controller.estimator.measured)
         self.u = np.zeros(len(self.plant.U_LOW), dtype=self.real)
         self.set_goal(controller.goal)
 
     def reset(self):
-        self.library.rl_mpc_reset(ctypes.byref(self.state), None)
+        self.c_reset(ctypes.byref(self.state), None)
 
     def set_goal(self, goal):
         self.goal = np.array(goal, dtype=self.real).reshape(-1)
@@ -122,7 +125,7 @@ class Exported:
         arrays = [ctypes.c_void_p(a.ctypes.data) for a in (y, self.goal, self.u)]
         pointers = ctypes.byref(self.state), *arrays, ctypes.byref(self.info)
         tick = time.perf_counter()
-        code = self.library.rl_mpc_step(*pointers)
+        code = self.c_step(*pointers)
         took = 1e3 * (time.perf_counter() - tick)
         if code:
             raise ValueError(f"rl_mpc_step returned {code}")

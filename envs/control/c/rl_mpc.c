@@ -12,7 +12,7 @@
 #include "rl_mpc_functions.h"
 #include "tree_qp.h"
 
-#ifdef __FAST_MATH__
+#if defined __FAST_MATH__ || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__)
 #error "compile rl_mpc.c without -ffast-math: it asks whether numbers are finite"
 #endif
 
@@ -56,8 +56,8 @@ size_t rl_mpc_size(void) { return ALIGNMENT + WORK + tree_qp_size(&shape); }
 
 int rl_mpc_init(rl_mpc_state *self, void *memory, size_t size) {
   if (!self || !memory) return RL_MPC_NOT_READY;
-  memset(self, 0, sizeof *self);
   if (size < rl_mpc_size()) return RL_MPC_MEMORY_TOO_SMALL;
+  memset(self, 0, sizeof *self);
   work_memory *work = (work_memory *)(((uintptr_t)memory + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
   memset(work, 0, sizeof *work);
   work->qp = tree_qp_init((char *)work + WORK, &shape);
@@ -128,7 +128,7 @@ static void estimate(rl_mpc_state *self, work_memory *work, const real *measurem
     const real value = measurement[i];
     present[i] = isfinite(value) && obs_low[measured[i]] <= value && value <= obs_high[measured[i]] && value != self->last[i];
     self->last[i] = value;
-    y[i] = clip(((present[i] ? value : 0) - x_center[measured[i]]) / x_scale[measured[i]], -1e12, 1e12);
+    y[i] = clip(((present[i] ? value : 0) - x_center[measured[i]]) / x_scale[measured[i]], -(real)1e12, (real)1e12);
     wrong[i] = !present[i];
   }
   info->restarted = 0;
@@ -163,9 +163,12 @@ static void belief(rl_mpc_state *self, work_memory *work) {
   const real longer = sqrt(SCENARIOS / 2.0);
   for (int s = 0; s < SCENARIOS; s++) {
     real z[NKNOWN], *psi = work->psi + NPSI * s;
-    const real *axis = work->axes + NKNOWN * (s < middle + pairs ? s - middle : s - middle - pairs);
-    const real sign = s < middle ? 0 : s < middle + pairs ? 1 : -1;
-    for (int i = 0; i < NKNOWN; i++) z[i] = sign != 0 ? self->z[i] + sign * (axis[i] * longer) : self->z[i];
+    memcpy(z, self->z, sizeof z);
+    if (s >= middle) { /* first on one side of the axes, then on the other */
+      const int pair = (s - middle) % pairs;
+      const real sign = s < middle + pairs ? 1 : -1;
+      for (int i = 0; i < NKNOWN; i++) z[i] += sign * (work->axes[NKNOWN * pair + i] * longer);
+    }
     for (int i = 0; i < NX; i++) {
       const real x = clip(z[i] * x_scale[i] + x_center[i], obs_low[i], obs_high[i]);
       work->start[NX * s + i] = (x - x_center[i]) / x_scale[i];
@@ -230,7 +233,7 @@ static void first_guesses(rl_mpc_state *self, work_memory *work, rl_mpc_info *in
     for (int i = 0; i < RL_MPC_INNER; i++) memcpy(work->guess + NU * i, self->plan + NU * later[i], NU * sizeof(real));
     compare(work, RL_MPC_SHIFTED, info);
     for (int i = 0; i < NX; i++) distance = fmax(distance, fabs((work->x[i] - self->x[i]) / x_scale[i]));
-    if (distance < RL_MPC_HARDLY_MOVED) { /* where things move, an action that is planned for later would be put off for ever */
+    if (distance < (real)RL_MPC_HARDLY_MOVED) { /* where things move, an action that is planned for later would be put off for ever */
       memcpy(work->guess, self->plan, sizeof work->guess);
       compare(work, RL_MPC_LAST, info);
     }
@@ -262,8 +265,8 @@ static int quadratic_program(work_memory *work, real *predicted) {
       slack_below += work->price[below] * fmax(low, 0);
       slack_above += work->price[above] * fmax(-high, 0);
       /* where there is no bound one out of reach, at the other's price */
-      work->low[at] = bounded_below[j] ? low : fmin(high, 0) - RL_MPC_OUT_OF_REACH;
-      work->high[at] = bounded_above[j] ? high : fmax(low, 0) + RL_MPC_OUT_OF_REACH;
+      work->low[at] = bounded_below[j] ? low : fmin(high, 0) - (real)RL_MPC_OUT_OF_REACH;
+      work->high[at] = bounded_above[j] ? high : fmax(low, 0) + (real)RL_MPC_OUT_OF_REACH;
       work->priced[below] = work->price[bounded_below[j] ? below : above];
       work->priced[above] = work->price[bounded_above[j] ? above : below];
     }
@@ -296,12 +299,12 @@ static void improve(rl_mpc_state *self, work_memory *work, double began, rl_mpc_
       return;
     }
     info->predicted = predicted;
-    const real tolerance = RL_MPC_TOLERANCE * fabs(info->cost), before = info->cost;
+    const real tolerance = (real)RL_MPC_TOLERANCE * fabs(info->cost), before = info->cost;
     real share = 1;
     for (int halvings = 0; halvings < (predicted > tolerance ? RL_MPC_SHARES : 1); halvings++, share /= 2) {
       for (int k = 0; k < PLAN; k++) work->guess[k] = clip(work->plan[k] + share * work->step[k], -1, 1);
       const real cost = cost_of(work, work->guess);
-      if (cost < before && !(before - cost < 0.1 * share * predicted)) {
+      if (cost < before && !(before - cost < (real)0.1 * share * predicted)) {
         memcpy(work->plan, work->guess, sizeof work->plan);
         info->cost = cost;
         break;
@@ -343,29 +346,33 @@ int rl_mpc_step(rl_mpc_state *self, const real *y, const real *goal, real *u, rl
   if (!self || !self->work || !y || !goal || !u) return RL_MPC_NOT_READY;
   work_memory *work = self->work;
   const double began = self->now_ms ? self->now_ms() : 0;
+  int code = RL_MPC_OK;
+  real near[NY], action[NU], applied[NU];
   info = info ? info : &unwanted;
   memset(info, 0, sizeof *info);
   info->rung = RL_MPC_HOLD;
-  for (int k = 0; k < NU; k++) u[k] = clip(self->u[k], u_low[k], u_high[k]);
-  for (int i = 0; i < NGOAL; i++)
-    if (!(goal_low[i] <= goal[i] && goal[i] <= goal_high[i])) return RL_MPC_BAD_GOAL;
+  for (int k = 0; k < NU; k++) applied[k] = clip(self->u[k], u_low[k], u_high[k]);
 #if !RL_MPC_NZ
-  if (!all_finite(y, NY)) return RL_MPC_NOT_FINITE;
+  if (!all_finite(y, NY)) code = RL_MPC_NOT_FINITE;
 #endif
-  real near[NY], action[NU]; /* angles to the turn nearest to the last */
-  const real turn = 6.283185307179586;
-  for (int i = 0; i < NY; i++) {
-    near[i] = turns[i] && isfinite(y[i]) ? fmod(y[i], turn) : y[i];
-    if (turns[i] && self->begun) near[i] += turn * rint((self->x[measured[i]] - near[i]) / turn);
+  for (int i = 0; i < NGOAL; i++)
+    if (!(goal_low[i] <= goal[i] && goal[i] <= goal_high[i])) code = RL_MPC_BAD_GOAL;
+  if (code == RL_MPC_OK) {
+    const real turn = (real)6.283185307179586;
+    for (int i = 0; i < NY; i++) { /* angles to the turn nearest to the last */
+      near[i] = turns[i] && isfinite(y[i]) ? fmod(y[i], turn) : y[i];
+      if (turns[i] && self->begun) near[i] += turn * rint((self->x[measured[i]] - near[i]) / turn);
+    }
+    estimate(self, work, near, info);
+    act(self, work, goal, began, action, info);
+    if (all_finite(action, NU))
+      for (int k = 0; k < NU; k++) applied[k] = clip(action[k], u_low[k], u_high[k]);
+    else
+      info->rung = RL_MPC_HOLD;
+    memcpy(self->x, work->x, sizeof self->x);
+    memcpy(self->u, applied, sizeof self->u);
+    self->begun = 1;
   }
-  estimate(self, work, near, info);
-  act(self, work, goal, began, action, info);
-  if (all_finite(action, NU))
-    for (int k = 0; k < NU; k++) u[k] = clip(action[k], u_low[k], u_high[k]);
-  else
-    info->rung = RL_MPC_HOLD;
-  memcpy(self->x, work->x, sizeof self->x);
-  memcpy(self->u, u, sizeof self->u);
-  self->begun = 1;
-  return RL_MPC_OK;
+  memcpy(u, applied, sizeof applied);
+  return code;
 }

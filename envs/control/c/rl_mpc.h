@@ -7,11 +7,20 @@
 #ifndef RL_MPC_H
 #define RL_MPC_H
 
+#include <math.h>
 #include <stddef.h>
 
-/* Everything that is compiled with RL_MPC_SINGLE computes in single precision. */
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* With RL_MPC_SINGLE everything is in single precision; files compiled with it and without do not link. */
 #ifdef RL_MPC_SINGLE
 typedef float rl_mpc_real;
+#define rl_mpc_size rl_mpc_size_single
+#define rl_mpc_init rl_mpc_init_single
+#define rl_mpc_reset rl_mpc_reset_single
+#define rl_mpc_step rl_mpc_step_single
 #else
 typedef double rl_mpc_real;
 #endif
@@ -24,12 +33,13 @@ $limits
    another 150 bytes per node. */
 #define RL_MPC_MEMORY $memory
 
-/* What rl_mpc_init, rl_mpc_reset and rl_mpc_step return. Where that is not RL_MPC_OK the state is as it was, and the action is the last. */
+/* What rl_mpc_init, rl_mpc_reset and rl_mpc_step return. Where that is not RL_MPC_OK the state is as it was, and rl_mpc_step gives the last
+   action again (but for RL_MPC_NOT_READY, which touches nothing). */
 enum {
   RL_MPC_OK,
   RL_MPC_NOT_FINITE,       /* $not_finite is not finite */
   RL_MPC_BAD_GOAL,         /* the goal is outside of RL_MPC_GOAL_LOW to RL_MPC_GOAL_HIGH, or not a number */
-  RL_MPC_NOT_READY,        /* a pointer is NULL, or the state has not been through rl_mpc_init */
+  RL_MPC_NOT_READY,        /* a pointer is NULL, or a state of zeros has not been through rl_mpc_init */
   RL_MPC_MEMORY_TOO_SMALL, /* less than rl_mpc_size() bytes */
 };
 
@@ -81,7 +91,12 @@ int rl_mpc_init(rl_mpc_state *state, void *memory, size_t size);
 /* Forgets everything, as at the start of an episode. u: the action that the plant gets now; NULL: 0. */
 int rl_mpc_reset(rl_mpc_state *state, const rl_mpc_real *u);
 
-/* The action u for the measurement y, always finite and within its limits. info may be NULL. */
+/* The action u, finite and within its limits, for the measurement y; u may be where y or goal is, info may be NULL.
+   $measurement */
 int rl_mpc_step(rl_mpc_state *state, const rl_mpc_real *y, const rl_mpc_real *goal, rl_mpc_real *u, rl_mpc_info *info);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

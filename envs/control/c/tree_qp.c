@@ -31,6 +31,10 @@
 #define DIAGONAL 1e-26
 #endif
 
+#if defined __FAST_MATH__ || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__)
+#error "compile tree_qp.c without -ffast-math: not-a-number must stay what it is"
+#endif
+
 #define ALIGNMENT 64
 #define ARGUMENTS 256 /* bytes that HPIPM's arguments may take; none at present */
 
@@ -74,7 +78,7 @@ static void describe(tree_qp *self, uintptr_t memory) {
   real *tolerance = &shape->tolerance;
   const int n = shape->nodes, inner = shape->inner, nu = shape->nu, rows = shape->rows;
   struct node *node = take(&memory, n * sizeof *node);
-  int *kids = take(&memory, n * sizeof *kids), *number = take(&memory, 6 * n * sizeof *number), at = 0;
+  int *kids = take(&memory, n * sizeof *kids), *number = take(&memory, 6 * n * sizeof *number), at = 0, none = 0;
   memset(node, 0, n * sizeof *node);
   for (int i = 0; i < n; i++) {
     node[i].idx = i, node[i].dad = shape->parent[i], node[i].stage = shape->stage[i], node[i].kids = kids + at;
@@ -88,6 +92,8 @@ static void describe(tree_qp *self, uintptr_t memory) {
   HPIPM(_dim_set_all)(&self->tree, number, number + n, number + 2 * n, number + 3 * n, number + 4 * n, number + 5 * n, &self->dim);
   HPIPM(_ipm_arg_create)(&self->dim, &self->arg, take(&memory, ARGUMENTS));
   HPIPM(_ipm_arg_set_default)(SPEED_ABS, &self->arg);
+  HPIPM(_ipm_arg_set_comp_res_exit)(&none, &self->arg); /* both are left to chance by the defaults */
+  HPIPM(_ipm_arg_set_comp_dual_sol_eq)(&none, &self->arg);
   HPIPM(_ipm_arg_set_iter_max)(&shape->most, &self->arg);
   HPIPM(_ipm_arg_set_tol_stat)(tolerance, &self->arg);
   HPIPM(_ipm_arg_set_tol_eq)(tolerance, &self->arg);
