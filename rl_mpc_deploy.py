@@ -97,8 +97,8 @@ class Args:
     """RL+MPC: hard bounds are violated only where every plan violates them"""
     change_weight: tuple[float, ...] | None = None
     """RL+MPC: price of the squared change of each action; default: 0. It decides where several ones hold a goal"""
-    combine: Literal["min", "first", "mean"] = "first"
-    """which of the twin critics V takes; --horizon 0 takes their minimum"""
+    combine: Literal["min", "first", "mean"] | None = None
+    """which of the twin critics V takes; default: the first, or what the checkpoint says; --horizon 0: the minimum"""
     iterations: int = 5
     """every planner: the most per step; each lowers the plan's cost"""
     deadline_ms: float | None = None
@@ -135,11 +135,11 @@ class Critic:
     actor, twins: (W, b) of every layer, b a column, of the policy's mean and of both critics.
     """
 
-    def __init__(self, data, combine="first"):
+    def __init__(self, data, combine=None):
         options = dict(data.get("plant_options", {}))
         self.mismatch_scale = options.pop("observe_mismatch", None)  # of a critic that observes the mismatch
         self.plant = envs.load(data["env"], **options)
-        self.goal_input, self.combine = data["goal_input"], combine
+        self.goal_input, self.combine = data["goal_input"], combine or data.get("combine", "first")
         # what a plan that ends in this value does unless told otherwise
         self.plan = dict(robust_horizon=1, sigma2=self.plant.MPC_SIGMA2, discount=1.0)
         self.plan |= dict(slack_weight=2.0 if data["args"].get("constraint_weight") else 1.0)
@@ -174,7 +174,7 @@ class Critic:
         return ca.vertcat(scaled, ca.sin(angles), ca.cos(angles))
 
 
-def load_critic(path, env, combine="first"):
+def load_critic(path, env, combine=None):
     """The `Critic` of a checkpoint.pt, which is data, never code. Raises ValueError for anything else."""
     return read_checkpoint(path, env, lambda data: Critic(data, combine))
 

@@ -34,10 +34,10 @@ def check_ranges(args, **ranges):
         if value is not None and not least <= value <= most:  # nor is nan
             raise ValueError(f"{flag(name)} is {value}; it must lie in [{least:g}, {most:g}]")
     for name, kind in type(args).__annotations__.items():
-        if get_origin(kind) is Literal and getattr(args, name) not in get_args(kind):
-            raise ValueError(
-                f"{flag(name)} is {getattr(args, name)!r}; choose one of {', '.join(get_args(kind))}"
-            )
+        optional, value = type(None) in get_args(kind), getattr(args, name)
+        literal = get_args(kind)[0] if optional else kind
+        if get_origin(literal) is Literal and value not in (*get_args(literal), *[None] * optional):
+            raise ValueError(f"{flag(name)} is {value!r}; choose one of {', '.join(get_args(literal))}")
 
 
 def check_effects(args, without_effect):
