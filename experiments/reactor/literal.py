@@ -89,7 +89,7 @@ class IpoptMPC(gm.ScenarioMPC):
         plans = [self.plan]
         if self.policy is not None and self.found is not None:
             # where things move, an action that is planned for later would be put off for ever
-            if np.abs((x0 - self.x_before) / self.x_scale).max() < self.HARDLY_MOVED:
+            if np.abs((x0 - self.x_before) / self.x_scale).max() < deploy.ScenarioMPC.HARDLY_MOVED:
                 plans.append(self.found)
         rolled_out = []
         for w, *multipliers in plans:
