@@ -115,7 +115,14 @@ def test_what_is_finished_is_not_repeated(quick):
 
 
 # studies without a figure of their own
-TABLE_ALONE = {"cstr_tune", "cstr_oracle", "cstr_stuck", "linear_value_mpc_train", "training_speed_profile"}
+TABLE_ALONE = {
+    "cstr_tune",
+    "cstr_oracle",
+    "cstr_stuck",
+    "linear_value_mpc_train",
+    "training_speed_profile",
+    "embedded",
+}
 DRAWN = [step for step in reproduce.STEPS if not step.name.startswith(("critic_", "reliability_"))]
 DRAWN = [step for step in DRAWN if step.name not in TABLE_ALONE]
 
