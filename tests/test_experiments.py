@@ -57,6 +57,7 @@ TEXT = {
     "peer_status",
     "peer_versions",
     "build",
+    "language",
 }
 
 

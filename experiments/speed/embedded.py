@@ -6,8 +6,8 @@
 `equal`: both in closed loop, each on its own plant, ten draws of 100 steps; the largest difference of an action, in its range. `elsewhere`:
 check.c with 1,000 recorded steps, and the closed loop of example.c, with other flags, by other compilers and for other processors, where
 they are installed; for aarch64 with the libraries of CasADi's wheel for it, in the folder --aarch64. `draws`: the paired draws of
-reactor/deploy.py, in C. `time`: steps in C on one core. `room`: memory and stack here, flash and memory on an ARM Cortex-M7. `fuzz`: random
-and impossible measurements and goals under AddressSanitizer and UndefinedBehaviorSanitizer.
+reactor/deploy.py, in C. `time`: steps in C on one core; `beside`: in turn with Python. `room`: memory and stack here, flash and memory
+on an ARM Cortex-M7. `fuzz`: random and impossible measurements and goals under AddressSanitizer and UndefinedBehaviorSanitizer.
 
 Writes results/embedded_STUDY.csv.
 """
@@ -60,7 +60,7 @@ M7 = "-O2 -mcpu=cortex-m7 -mfpu=fpv5-d16 -mfloat-abi=hard -mthumb"
 
 @dataclass(frozen=True)
 class Args(common.StudyArgs):
-    study: tuple[str, ...] = ("equal", "elsewhere", "draws", "time", "room", "fuzz")
+    study: tuple[str, ...] = ("equal", "elsewhere", "draws", "time", "beside", "room", "fuzz")
     """which studies"""
     episodes: int = 200
     """draws of `draws`"""
@@ -220,6 +220,28 @@ def timed(args, folder):
     return rows
 
 
+def beside(args, folder):
+    """Rows: steps in Python and in C, in turn on the same draws."""
+    rows = []
+    for label in ("N = 5", "N = 1"):
+        pair = exported(folder / label, 2, **CONFIGURED[label])
+        milliseconds = [[], []]
+        for start, psi in zip(*draws(pair[0].plant, 2 if args.quick else 60, args.seed)):
+            for controller, log in zip(pair, milliseconds):
+                controller.reset()
+                x = start
+                for _ in range(3 if args.quick else 100):
+                    tick = time.perf_counter()
+                    u = controller.make_step(x)
+                    log.append(1e3 * (time.perf_counter() - tick))
+                    x = controller.plant.step(x, u, psi)
+        for language, log in zip(("Python", "C"), milliseconds):
+            row = {"controller": label, "language": language, "steps": len(log)}
+            row |= dict(zip(("ms_median", "ms_p95"), np.quantile(log, [0.5, 0.95])))
+            rows.append(rounded(row, 4) | {"machine": common.machine()})
+    return rows
+
+
 def sections(folder, *sources, compiler="arm-none-eabi-gcc", flags=M7):
     """Bytes of code and constants, and of variables, of sources compiled there."""
     command = [
@@ -299,6 +321,7 @@ STUDIES = {
     "elsewhere": elsewhere,
     "draws": in_draws,
     "time": timed,
+    "beside": beside,
     "room": room,
     "fuzz": fuzz,
 }
