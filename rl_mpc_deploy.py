@@ -68,9 +68,9 @@ class Args:
     horizon: int = 5
     """prediction steps N of RL+MPC; 0: the action that maximises the critic, no prediction"""
     critic: Path | None = None
-    """a checkpoint.pt of sac_her_branching.py, or latest: the newest of this plant in runs/. Default:
-    experiments/pretrained/{env}_constrained.pt, or if there is none {env}_robust.pt (cstr: the first knows the price
-    of constraints, the second is the paper's)"""
+    """a checkpoint.pt of a script that trains, or latest: the newest of this plant in runs/. Default: what
+    experiments/pretrained/ has of {env}_constrained.pt, {env}_robust.pt and {env}_planner.pt, in this order (cstr: the
+    first knows the price of constraints, the second is the paper's)"""
     goal: tuple[float, ...] | None = None
     """what to hold (cstr: c_B in mol/l); default: the plant's evaluation goal"""
     episodes: int = 16
@@ -402,21 +402,27 @@ class ScenarioMPC(Controller):
         J, states = self.rollout(*self.problem, u)
         return J.item() if np.isfinite(states).all() else np.nan
 
-    def improve(self, u, cost, tick):
-        """The plan u after as many iterations as it may have, and its cost."""
+    def program(self, u):
+        """The tree's quadratic program about the plan u: the arguments of `qp.solve`."""
         weight, u_before = self.problem[2], self.problem[-1]
         change, price = weight[: self.tree.inner] * self.change_weight, weight[1:, :, None] * self.slack_price
-        parent, barrier = self.tree.parent[1 : self.tree.inner], max(price.max(initial=0), 1.0)
+        states, A, B, slope, hessian = self.linearise(*self.problem, u)
+        low, high = self.low - states[:, self.rows], self.high - states[:, self.rows]
+        slope, hessian = slope * weight[1:], hessian.reshape(len(price), -1) * weight[1:]
+        moved = u - np.concatenate([u_before[None], u[self.tree.parent[1 : self.tree.inner]]])
+        barrier = max(price.max(initial=0), 1.0)
+        return A, B, slope, hessian, -1 - u, 1 - u, low, high, price, change, moved, barrier
+
+    def improve(self, u, cost, tick):
+        """The plan u after as many iterations as it may have, and its cost."""
         for _ in range(self.iterations):
             if self.deadline_ms is not None and 1e3 * (time.perf_counter() - tick) > self.deadline_ms:
                 self.stats |= {"stop": "late", "late": True}
                 break
             self.stats["iterations"] += 1
-            states, A, B, slope, hessian = self.linearise(*self.problem, u)
-            low, high = self.low - states[:, self.rows], self.high - states[:, self.rows]
-            slope, hessian = slope * weight[1:], hessian.reshape(len(price), -1) * weight[1:]
-            bounds, moved = (-1 - u, 1 - u, low, high), u - np.concatenate([u_before[None], u[parent]])
-            step, found = self.qp.solve(A, B, slope, hessian, *bounds, price, change, moved, barrier)
+            program = self.program(u)
+            low, high, price = program[6:9]
+            step, found = self.qp.solve(*program)
             if step is None:
                 self.stats["stop"] = "unsolved"
                 break
@@ -502,15 +508,13 @@ def build_controller(name, args):
 def critic_path(args):
     """The checkpoint that the arguments mean. Raises ValueError if it is to be the latest and there is none."""
     if args.critic == Path("latest"):
-        runs = Path("runs").glob(f"{args.env}__sac_her_branching__*/checkpoint.pt")
+        runs = Path("runs").glob(f"{args.env}__*/checkpoint.pt")
         latest = max(runs, key=lambda path: path.stat().st_mtime, default=None)
         if latest is None:
-            raise ValueError(
-                f"--critic latest: there is no runs/{args.env}__sac_her_branching__*/checkpoint.pt"
-            )
+            raise ValueError(f"--critic latest: there is no runs/{args.env}__*/checkpoint.pt")
         return latest
     folder = Path(__file__).parent / "experiments/pretrained"
-    shipped = [folder / f"{args.env}_{kind}.pt" for kind in ("constrained", "robust")]
+    shipped = [folder / f"{args.env}_{kind}.pt" for kind in ("constrained", "robust", "planner")]
     return args.critic or next((path for path in shipped if path.exists()), shipped[0])
 
 

@@ -454,6 +454,8 @@ def main(args, kind=SAC):
         for name, value in scalars.items():
             writer.add_scalar(name, value, run.step)
 
+    if plant.EXPECT:
+        print(f"notice: {plant.EXPECT}", file=sys.stderr)
     losses = {}
     bar = tqdm(total=args.total_timesteps, initial=run.step, unit="step", mininterval=0.5, disable=None)
     with until_interrupted() as interrupted, bar:

@@ -34,6 +34,7 @@ It may name, in place of the default in brackets:
     goal_error(achieved, goal, xp)    its squared norm enters the Gaussian (difference; of angles 1 - cos)
     percentage_error(achieved, goal)  for tables (percent of half the box's width)
     TRAINING                    arguments of sac_her_branching.py whose defaults it changes ({})
+    EXPECT                      what sac_her_branching.py is to say of it before it begins ("")
     BENCHMARK                   the MPC that rl_mpc_deploy.py compares with: "horizon" (20), "slack_price" (2, n_x) below
                                 and above, inf: a hard bound (all), "change_weight" (n_u,) (0)
     economic_cost(x, xp)        added to RL+MPC's stage cost, to choose among steady states that hold a goal (0)

@@ -134,6 +134,7 @@ def _defaults(p):
         MODEL_SUBSTEPS=4,
         MEASURED=tuple(p.STATE_NAMES),
         TRAINING={},
+        EXPECT="",
     )
     values |= dict(OBS_LOW=np.full(len(half), -np.inf), OBS_HIGH=np.full(len(half), np.inf))
     values |= dict(START=middle, START_NOISE=half / 10)

@@ -7,6 +7,7 @@ call of the same command continues, and a change of the code makes everything ne
 import contextlib
 import csv
 import hashlib
+import importlib
 import inspect
 import io
 import json
@@ -33,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 PRETRAINED = HERE / "pretrained"
 ENVS = ROOT / "envs"
-TRAINING = ROOT / "sac_her_branching.py"
+TRAINING, PLANNER = ROOT / "sac_her_branching.py", HERE / "planner_value_iteration.py"  # which learn a value
 SCRIPTS = TRAINING, ROOT / "goal_mpc.py", ROOT / "rl_mpc_deploy.py"
 # all code as it was when this process began: an edit while it runs does not file old results under new code
 FILES = sorted(
@@ -160,25 +161,27 @@ def collect(function, cells, runs, jobs=1, uses=()):
 # Trained agents
 
 
-def agent_folder(settings, runs, kind=None):
-    """Where `train` keeps the agent with these arguments of sac_her_branching.py, which all of them and the code tell from others."""
-    import sac_her_branching as sac  # with torch, which few experiments need
-
-    values = vars(sac.Args(**settings)) | {"out": None, "save_every": None}
+def agent_folder(settings, runs, kind=None, script=TRAINING):
+    """Where `train` keeps the agent with these arguments, which all of them and the code tell from others."""
+    module = _module(script)
+    values = vars(module.Args(**settings)) | {"out": None, "save_every": None}
     values = {name: value.name if isinstance(value, Path) else value for name, value in values.items()}
-    kind = kind or sac.SAC
-    code = digest([TRAINING, ENVS, kind], kind.__qualname__, values)
+    places = [script, ENVS, *([kind] if kind else []), *(SCRIPTS if script != TRAINING else [])]
+    code = digest(places, kind and kind.__qualname__, values)
     return runs / f"agents/{values['env']}_{values['seed']}_{code}"
 
 
-def _train(settings, folder, jobs, kind):
-    import sac_her_branching as sac
+def _module(script):
+    return importlib.import_module(".".join(script.relative_to(ROOT).with_suffix("").parts))
 
+
+def _train(settings, folder, jobs, kind, script):
+    module, own = _module(script), dict(save_every=0) if script == TRAINING else {}
     folder.parent.mkdir(parents=True, exist_ok=True)
     quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
     with tempfile.TemporaryDirectory(dir=folder.parent) as place, quiet[0], quiet[1]:
         tick = time.perf_counter()
-        run = sac.main(sac.Args(out=Path(place), save_every=0, **settings), kind or sac.SAC)
+        run = module.main(module.Args(out=Path(place), **own, **settings), *([kind] if kind else []))
         seconds = round(time.perf_counter() - tick, 1)
         (run / "resume.pt").unlink()  # as large as the replay buffer
         record = {"wall_seconds": seconds, "jobs": jobs, "machine": machine()}
@@ -190,15 +193,15 @@ def _train(settings, folder, jobs, kind):
                 raise
 
 
-def train(agents, runs, jobs, kind=None):
-    """Folders of agents, dictionaries of arguments of sac_her_branching.py; only those are trained that `runs` lacks.
+def train(agents, runs, jobs, kind=None, script=TRAINING):
+    """Folders of agents, dictionaries of arguments of a script that trains; only those are trained that `runs` lacks.
 
-    Each holds checkpoint.pt, evaluations.csv and run.json: wall_seconds, jobs beside each other, machine. kind: a subclass of the script's
-    SAC.
+    Each holds checkpoint.pt, evaluations.csv (planner_value_iteration.py: sweeps.csv) and run.json: wall_seconds, jobs beside each other,
+    machine. kind: a subclass of the SAC of sac_her_branching.py.
     """
-    folders = [agent_folder(settings, runs, kind) for settings in agents]
+    folders = [agent_folder(settings, runs, kind, script) for settings in agents]
     missing = {folder: settings for folder, settings in zip(folders, agents) if not folder.exists()}
-    todo = [(settings, folder, jobs, kind) for folder, settings in missing.items()]
+    todo = [(settings, folder, jobs, kind, script) for folder, settings in missing.items()]
     each(_train, todo, jobs, "agent", len(folders) - len(todo))
     return folders
 

@@ -55,6 +55,10 @@ def training(name, *arguments, minutes=1.0):
     return Step(f"critic_{name}", ("sac_her_branching.py", *arguments), minutes)
 
 
+QUICK = {  # of the scripts that train
+    "sac_her_branching.py": "--total-timesteps 2000 --hidden 16 16",
+    "experiments/planner_value_iteration.py": "--sweeps 1 --states 60 --length 10 --updates 20 --loops 2 --steps 51",
+}
 RUNS = ("runs",)
 TWO_CORES = dict(alone=True, takes=RUNS)  # has processes of its own
 CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
@@ -64,12 +68,16 @@ STEPS = [  # what others wait for and what takes long first
     training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
     training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
     training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
+    Step("critic_double_pendulum_planner", ("experiments/planner_value_iteration.py",), 13),
     study("linear_value_mpc", "linear/value_mpc", "train", 70),
     study("linear_value_mpc", "linear/value_mpc", "distance", 20, ["linear_value_mpc_train"]),
     study("cstr_deploy", "reactor/deploy", minutes=26, needs=CRITICS),
     study("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
     study("cstr_oracle", "reactor/oracle", minutes=62, needs=["cstr_deploy"]),
     study("cstr_frontier", "reactor/frontier", minutes=6, needs=["cstr_oracle"]),
+    study("cstr_planner", "reactor/planner_value", minutes=60, needs=["cstr_oracle"]),
+    study("dip_value", "pendulum/learned_value", "train", 40),
+    study("dip_value", "pendulum/learned_value", "ablation", 60),
     study("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
     study("cstr_tune", "reactor/tune", minutes=86, needs=CRITICS),
     study("cstr_training", "reactor/training", minutes=25),
@@ -91,7 +99,9 @@ STEPS = [  # what others wait for and what takes long first
     study("reliability", "trust/reliability", "checkpoints", 2),
     study("reliability", "trust/reliability", "deployments", 15, CRITICS),
     study("dip_equilibria", "pendulum/equilibria", minutes=2, takes=()),
+    study("dip_value", "pendulum/learned_value", "equilibria", 1, ["critic_double_pendulum_planner"]),
     study("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
+    study("dip_value", "pendulum/learned_value", "loops", 30, ["dip_value_train"], alone=True),
     study("dip_performance", "pendulum/performance", minutes=30, alone=True),
     study("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
     study("linear_value_mpc", "linear/value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
@@ -153,7 +163,7 @@ def run(step, args, done):
     if critic:
         trained = args.runs / f"critics/{step.name}_{os.getpid()}"
         command += ["--out", str(trained)]
-        command += ["--total-timesteps", "2000", "--hidden", "16", "16"] if args.quick else []
+        command += QUICK[step.command[0]].split() if args.quick else []
     else:
         command += ["--out", str(args.out)] + ["--quick"] * args.quick
         command += ["--jobs", str(args.step_jobs)] if "jobs" in step.takes else []

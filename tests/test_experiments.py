@@ -58,6 +58,8 @@ TEXT = {
     "peer_versions",
     "build",
     "language",
+    "method",
+    "starts",
 }
 
 

@@ -190,6 +190,20 @@ ONE_SIDED = ("branching twice, changes", "some bounds")
 BOTH_SIDED = [shape for shape in SHAPES if shape not in ONE_SIDED]
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_multipliers_are_those_of_another_solver(shape):
+    """Of what has one solution, and with one stage the slopes of the cost themselves."""
+    tree, _, solver, oracle = shaped(shape)
+    for problem in random_problems(shape, "plain", 6):
+        solved = [each.solve(*problem)[0] for each in (solver, oracle("piqp"))]
+        assert solved[0] == pytest.approx(solved[1], abs=1e-4)
+        found = solver.multipliers()
+        assert found.shape == (tree.nodes[1], SHAPES[shape][3])
+        assert found == pytest.approx(oracle("piqp").multipliers(), abs=2e-3, rel=2e-3)
+        again = solver.solve(*problem)[0]  # which the multipliers leave as it is
+        assert np.array_equal(solved[0], again)
+
+
 def test_the_shapes_have_the_bounds_that_they_are_for():
     for shape in SHAPES:
         _, active, _, _ = shaped(shape)

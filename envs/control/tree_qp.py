@@ -101,6 +101,7 @@ class TreeQP:
     `solve` takes arrays with a row per edge (A, B, slope, hessian, x_low, x_high, price (edges, 2, rows)) or per node with children
     (u_low, u_high, change, moved), A, B and hessian transposed as CasADi stores them. It returns du (inner, n_u) and the cost there, or
     (None, nan) if the problem is not solved. `iterations`: of the last solve.
+    `multipliers()` of the last solve: how the cost changes with the states of stage 1, (nodes of stage 1, n_x).
     """
 
     def __init__(self, tree, n_x, n_u, active, changes):
@@ -126,7 +127,7 @@ class TreeQP:
         shapes += [(edges, rows), (edges, rows), (edges, 2, rows), inner, inner]
         self.given, self.du = list(map(np.zeros, shapes)), np.zeros(inner)
         self.cost, self.counted = ctypes.c_double(), ctypes.c_int()
-        self.memory = list(map(pointer, self.given))
+        self.memory, self.early = list(map(pointer, self.given)), tree.nodes[1]
         self.found = pointer(self.du), ctypes.byref(self.cost), ctypes.byref(self.counted)
 
     @property
@@ -142,6 +143,11 @@ class TreeQP:
         )
         solved = status == 0 and np.isfinite(self.du).all()
         return (self.du, self.cost.value) if solved else (None, np.nan)
+
+    def multipliers(self):
+        found = np.zeros((self.early, self.given[2].shape[1]))
+        self.library.tree_qp_multipliers(self.instance, pointer(found))
+        return found
 
 
 def two_sided(active, x_low, x_high, price):
@@ -194,7 +200,7 @@ class ConicQP:
         )
         self.solver = ca.qpsol("qp", plugin, problem, quiet | {"error_on_fail": False} | (options or {}))
         self.active = active[:, self.row]
-        self.square = edges, n_x, n_x
+        self.square, self.early = (edges, n_x, n_x), tree.nodes[1]
         self.zeros, self.shape, self.at = np.zeros(edges * n_x), (inner, n_u), edges * n_x
 
     def solve(self, A, B, slope, hessian, u_low, u_high, x_low, x_high, price, change, moved, barrier=None):
@@ -221,6 +227,10 @@ class ConicQP:
             ubx=np.concatenate([self.zeros + np.inf, np.ravel(u_high), slack + np.inf]),
         )
         du = np.array(found["x"]).ravel()[self.at :][: u_low.size].reshape(self.shape)
+        self.early_multipliers = -np.array(found["lam_g"]).ravel()[: self.early * self.square[1]]
         if not self.solver.stats()["success"] or not np.isfinite(du).all():
             return None, np.nan
         return du, float(found["f"])
+
+    def multipliers(self):
+        return self.early_multipliers.reshape(self.early, -1)

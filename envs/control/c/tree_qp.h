@@ -32,6 +32,10 @@ int tree_qp_solve(tree_qp *self, const real *A, const real *B, const real *q, co
                   const real *u_high, const real *x_low, const real *x_high, const real *price, const real *c,
                   const real *moved, real barrier, real *du, real *cost, int *iterations);
 
+/* Solves the last problem once more and finds how its cost changes with the states dx of stage 1, (their number, nx), if all that comes
+   after them is adapted. */
+void tree_qp_multipliers(tree_qp *self, real *multipliers);
+
 /* Projection of the symmetric part of h, (n, n), to positive semidefinite matrices; work: 2 n^2 numbers */
 void tree_qp_positive_part(int n, const real *h, real *result, real *work);
 
