@@ -119,9 +119,9 @@ def test_two_sweeps_of_short_plans_learn_what_a_long_one_is_worth(tmp_path):
     """The oracle: plans of forty steps, beyond which the discount leaves little. Two states, linear."""
     plant = envs.load("linear")
     args = pvi.Args(
-        env="linear", sigma=0.5, gamma=0.9, lookahead=4, horizon=4, sweeps=2, states=3000, updates=1000
+        env="linear", sigma=0.5, gamma=0.9, lookahead=4, horizon=4, sweeps=2, states=2000, updates=600
     )
-    args = replace(args, loops=2, steps=51, hidden=(64, 64), out=tmp_path)
+    args = replace(args, loops=2, steps=51, hidden=(32, 32), out=tmp_path)
     V = rl.export(rl.Critic(torch.load(pvi.main(args) / "checkpoint.pt")))[2]
     none, long = (pvi.build_teacher(replace(args, lookahead=T), plant, None) for T in (4, 40))
     found = []
