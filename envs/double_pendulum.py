@@ -61,9 +61,7 @@ METRIC_SIGMA2 = 0.01  # of time near goal and time outside constraints, as in th
 MODEL_SUBSTEPS = 2  # Runge-Kutta steps per sampling time in predictions; the simulated plant takes 8
 
 TRAINING = dict(hidden=(128, 128), gamma=0.97, num_envs=64, total_timesteps=300_000)
-EXPECT = (
-    "SAC learns to swing here, not to hold; experiments/planner_value_iteration.py learns both in minutes"
-)
+EXPECT = "SAC learns to swing, not to hold; experiments/planner_value_iteration.py learns both in minutes"
 
 GRAVITY = 9.80665  # m/s^2
 CART_MASS, ROD_1_MASS, ROD_2_MASS = 0.6, 0.2, 0.2  # kg
