@@ -61,7 +61,7 @@ class Args:
     env: str = "double_pendulum"
     """the plant: NAME of a module envs/NAME.py"""
     seed: int = 0
-    """of states, first guesses and networks; the closed loops are the same for every seed"""
+    """of states, networks and the evaluation's starts; same seed, same machine, same numbers"""
     sweeps: int = 8
     """rounds of planning and fitting"""
     states: int = 24_000
