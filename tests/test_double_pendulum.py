@@ -137,7 +137,7 @@ def test_vector_env_follows_the_physics_and_errors_go_the_short_way_round():
     new, reward, _, _, infos = vec.step(action)
     np.testing.assert_allclose(new["observation"], dp.step(obs["observation"], action, infos["psi"]))
     error = 1 - np.cos(new["achieved_goal"] - obs["desired_goal"])
-    np.testing.assert_allclose(reward, np.exp(-(error**2).sum(1) / 0.02))
+    np.testing.assert_allclose(reward, np.exp(-(error**2).sum(1) / 0.5))
     assert dp.percentage_error(np.array([2 * np.pi, np.pi]), np.zeros(2)) == pytest.approx(50)
     for _ in range(150):
         new = vec.step(np.full((4, 1), 5.0))[0]
