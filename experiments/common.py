@@ -35,6 +35,9 @@ ROOT = HERE.parent
 PRETRAINED = HERE / "pretrained"
 ENVS = ROOT / "envs"
 TRAINING, PLANNER = ROOT / "sac_her_branching.py", HERE / "planner_value_iteration.py"  # which learn a value
+QUICK_PLANNER = dict(
+    sweeps=1, states=40, length=4, updates=5, lookahead=3, horizon=2, loops=2, steps=51, hidden=(8, 8)
+)
 SCRIPTS = TRAINING, ROOT / "goal_mpc.py", ROOT / "rl_mpc_deploy.py"
 # all code as it was when this process began: an edit while it runs does not file old results under new code
 FILES = sorted(

@@ -90,8 +90,8 @@ class Args:
     """count what closed loops got; off: only what their plans promised, as always where plants are drawn"""
     slopes: float = 0.1
     """weight of the slopes in the fit"""
-    ensemble: Literal["mean", "first", "min"] = "mean"
-    """which of the two fitted networks V takes"""
+    combine: Literal["mean", "first", "min"] = "mean"
+    """which of the two fitted networks V takes, as in rl_mpc_deploy.py"""
     hidden: tuple[int, ...] = (128, 128)
     """widths of the hidden layers (SiLU)"""
     updates: int = 12_000
@@ -191,7 +191,8 @@ def teach(args, teacher, x, goal, psi):
         u = teacher.make_step(x)
         if teacher.stats["rung"] != "plan":
             break
-        rows.append([x, goal, teacher.value(), teacher.slope(), teacher.plan[0].copy()])
+        slope = teacher.slope() if args.slopes else np.zeros(len(x))  # a third of the time
+        rows.append([x, goal, teacher.value(), slope, teacher.plan[0].copy()])
         x = plant.step(x, u, psi)
         rewards.append(reward(args, plant, x, goal))
     for now, later, got in zip(rows[-2::-1], rows[:0:-1], rewards[-2::-1]):
@@ -268,7 +269,7 @@ class Learner:
             critic[name] *= self.most
         head = {"format": FORMAT, "env": a.env, "plant_options": {}, "env_id": self.plant.ENV_ID}
         head |= {"network": self.network, "goal_input": "error", "scaling": self.scaling.values}
-        head |= {"actor": dict(self.actor.state_dict()), "critic": critic, "combine": a.ensemble}
+        head |= {"actor": dict(self.actor.state_dict()), "critic": critic, "combine": a.combine}
         plan = dict(discount=a.gamma, sigma2=a.sigma**2)
         plan |= dict(slack_weight=a.slack_weight, robust_horizon=a.robust_horizon)
         args = {name: value for name, value in plain(a).items() if name not in ("out", "resume")}
@@ -298,11 +299,11 @@ def closed_loops(args, plant, path):
     for i in range(2 * n):
         goal = plant.TRAIN_GOALS[i % len(plant.TRAIN_GOALS)]
         controller.set_goal(goal)
-        path, _, row = run_episode(controller, plant, x[i], psi[i], goal, args.steps)
-        states.append(path[:-1])
+        reached, _, row = run_episode(controller, plant, x[i], psi[i], goal, args.steps)
+        states.append(reached[:-1])
         aims.append(np.broadcast_to(goal, (args.steps, len(goal))))
-        near = envs.goal_reward(plant, path[-51:, plant.GOAL_INDEX], goal, sigma2=plant.METRIC_SIGMA2).mean()
-        rows.append(row | {"held": near > 0.9})
+        near = envs.goal_reward(plant, reached[-51:, plant.GOAL_INDEX], goal, sigma2=plant.METRIC_SIGMA2)
+        rows.append(row | {"held": near.mean() > 0.9})
     near, outside, held, ms = (
         np.array([row[key] for row in rows])
         for key in ("time_near_goal", "time_outside_constraints", "held", "solve_ms_median")

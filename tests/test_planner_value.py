@@ -176,6 +176,16 @@ def test_the_checkpoint_is_one_of_the_deployed_controller_and_of_the_training_sc
         assert values == pytest.approx([float(V(state, pendulum.EVAL_GOAL))] * 2, abs=1e-12)
 
 
+def test_the_latest_critic_may_be_one_of_this_script(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    args = rl.Args(env="double_pendulum", critic="latest")
+    with pytest.raises(ValueError, match="there is no runs/double_pendulum__"):
+        rl.critic_path(args)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / trained.name).symlink_to(trained)
+    assert rl.critic_path(args).samefile(trained / "checkpoint.pt")
+
+
 def test_an_interrupted_run_continues_to_the_same_numbers(trained, tmp_path):
     run = pvi.main(pvi.Args(**FEW | dict(sweeps=1), out=tmp_path))
     data = torch.load(run / "resume.pt")

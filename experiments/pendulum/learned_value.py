@@ -36,10 +36,7 @@ plant = envs.load("double_pendulum")
 GOALS = {name: np.array(goal) for name, goal in plant.GOALS.items()}
 ANYWHERE = np.array([1.0, np.pi, np.pi, 1.0, 2.0, 2.0])  # half-widths
 HORIZONS = (5, 8, 10, 12, 15, 20)
-QUICK = dict(
-    sweeps=1, states=40, length=4, updates=5, lookahead=4, horizon=3, loops=2, steps=51, hidden=(8, 8)
-)
-TENTH = dict(states=6_000, sweeps=3, updates=3_000)  # of the budget
+TENTH = dict(states=6_000, sweeps=3, updates=3_000)  # of all plans and updates
 SEQUENCE = "up-down", "down-up", "up-up"
 SHOWN = {  # controller: label, colour, marker
     "rl_mpc": ("short plan with the learned value", GREEN, "o"),
@@ -58,8 +55,8 @@ VARIANTS = {  # of the ablation
     "sigma = 1": dict(sigma=1.0),
     "sigma = 0.5": dict(sigma=0.5),
     "one sweep": dict(sweeps=1),
-    "one network": dict(ensemble="first"),
-    "the lower of two": dict(ensemble="min"),
+    "one network": dict(combine="first"),
+    "the lower of two": dict(combine="min"),
 }
 
 
@@ -80,7 +77,7 @@ class Args(common.ParallelArgs):
 
 def agents(args, changed, budget=None):
     """Arguments of planner_value_iteration.py, of every seed."""
-    settings = (QUICK if args.quick else budget or {}) | changed
+    settings = (common.QUICK_PLANNER if args.quick else budget or {}) | changed
     return [settings | dict(seed=args.seed + i) for i in range(1 if args.quick else args.seeds)]
 
 
@@ -165,9 +162,8 @@ def study_loops(args):
         cells += [("goal_mpc.py", long[0], starts, "up-up", args.seed)]
     # not from anywhere: plans that do not succeed take seconds each
     cells += [("goal_mpc.py", long[-1], "start", "up-up", args.seed)]
-    cells += [
-        ("rl_mpc", horizons[-2:][0], "start", goal, seed) for seed in values for goal in list(GOALS)[1:]
-    ]
+    usual, others = 3 if args.quick else 15, ("up-down", "down-up")
+    cells += [("rl_mpc", usual, "start", goal, seed) for seed in values for goal in others]
     episodes = 2 if args.quick else args.episodes
     cells = [Loops(*cell, episodes, values[cell[-1]]) for cell in cells]
     common.write(common.collect(loops, cells, args.runs, args.jobs), args.table("dip_value_loops"))

@@ -26,10 +26,9 @@ from experiments.reactor.oracle import gaps
 WEIGHT, HORIZONS = 5.0, (1, 5)  # of the oracle's objective; of the deployed plans
 PLANNER = dict(env="cstr", robust_horizon=1, sigma=0.1, slack_weight=2.0, lookahead=15, horizon=10)
 PLANNER |= dict(gamma=0.98, box=1.0, states=4_000, sweeps=8, steps=60, updates=4_000)
-FEW = dict(sweeps=1, states=40, length=4, updates=5, lookahead=2, horizon=2, loops=2, steps=51, hidden=(8, 8))
 METHODS = {  # script, its arguments, and those of --quick
     "SAC": (common.TRAINING, KINDS["constraint-aware"], dict(total_timesteps=2000)),
-    "planner": (common.PLANNER, PLANNER, FEW),
+    "planner": (common.PLANNER, PLANNER, common.QUICK_PLANNER),
 }
 STYLES = {"SAC": (BLUE, "o"), "planner": (GREEN, "s")}
 
