@@ -14,7 +14,6 @@ experiment itself. A command that a lost worker leaves behind does no harm: resu
 import contextlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -51,66 +50,59 @@ def study(name, script, part=None, minutes=1.0, needs=(), **options):
     return Step(f"{name}_{part}" if part else name, command, minutes, tuple(needs), **options)
 
 
-def training(name, *arguments, minutes=1.0):
-    return Step(f"critic_{name}", ("sac_her_branching.py", *arguments), minutes)
+def critic(name, minutes=1.0):
+    return Step(f"critic_{name}", ("experiments/critics.py", "--critic", name), minutes, takes=("runs",))
 
 
-QUICK = {  # of the scripts that train
-    "sac_her_branching.py": "--total-timesteps 2000 --hidden 16 16",
-    "experiments/planner_value_iteration.py": "--sweeps 1 --states 60 --length 10 --updates 20 --loops 2 --steps 51",
-}
-RUNS = ("runs",)
-TWO_CORES = dict(alone=True, takes=RUNS)  # has processes of its own
+EMBEDDED = ("experiments/speed/embedded.py", "--study")
 CRITICS = ("critic_cstr_robust", "critic_cstr_nominal", "critic_cstr_constrained", "critic_cstr_offset_free")
 STEPS = [  # what others wait for and what takes long first
-    training("cstr_robust", "--env", "cstr"),
-    training("cstr_nominal", "--env", "cstr", "--scenarios", "nominal"),
-    training("cstr_constrained", "--env", "cstr", "--constraint-weight", "3"),
-    training("cstr_offset_free", "--env", "cstr", "--observe-mismatch", "--scenario-hold", "episode"),
-    training("linear_robust", "--env", "linear", "--dim", "32", "--system", "0", minutes=6),
-    Step("critic_double_pendulum_planner", ("experiments/planner_value_iteration.py",), 13),
-    study("linear_value_mpc", "linear/value_mpc", "train", 70),
-    study("linear_value_mpc", "linear/value_mpc", "distance", 20, ["linear_value_mpc_train"]),
-    study("cstr_deploy", "reactor/deploy", minutes=26, needs=CRITICS),
-    study("cstr_deploy", "reactor/deploy", "critics", 10, CRITICS),
-    study("cstr_oracle", "reactor/oracle", minutes=62, needs=["cstr_deploy"]),
+    *(critic(name.removeprefix("critic_")) for name in CRITICS),
+    critic("linear_robust", 6),
+    critic("double_pendulum_planner", 13),
+    study("linear_value_mpc", "linear/value_mpc", "train", 55, ["critic_linear_robust"]),
+    study("linear_value_mpc", "linear/value_mpc", "distance", 9, ["linear_value_mpc_train"]),
+    study("dip_value", "pendulum/learned_value", "train", 26, ["critic_double_pendulum_planner"]),
+    study("dip_value", "pendulum/learned_value", "loops", 17, ["dip_value_train"]),
+    study("dip_value", "pendulum/learned_value", "equilibria", 1, ["critic_double_pendulum_planner"]),
+    study("cstr_deploy", "reactor/deploy", minutes=20, needs=CRITICS),
+    study("cstr_deploy", "reactor/deploy", "critics", 4, CRITICS),
+    study("cstr_oracle", "reactor/oracle", minutes=18, needs=["cstr_deploy"]),
     study("cstr_frontier", "reactor/frontier", minutes=6, needs=["cstr_oracle"]),
     study("cstr_planner", "reactor/planner_value", minutes=25, needs=["cstr_oracle"]),
-    study("dip_value", "pendulum/learned_value", "train", 40),
-    study("dip_value", "pendulum/learned_value", "ablation", 55),
-    study("cstr_ablation", "reactor/ablation", minutes=100, needs=["cstr_deploy_critics"]),
-    study("cstr_tune", "reactor/tune", minutes=86, needs=CRITICS),
-    study("cstr_training", "reactor/training", minutes=25),
-    study("cstr_offline", "reactor/offline", minutes=2, needs=["cstr_training"]),
-    study("cstr_offline", "reactor/offline", "ablation", 30, ["cstr_training"]),
-    study("cstr_observers", "reactor/observers", minutes=40, needs=["cstr_offline"]),
-    study("cstr_estimation", "reactor/estimation", minutes=40, needs=CRITICS),
-    study("cstr_stuck", "reactor/stuck", minutes=24, needs=CRITICS),
-    study("cstr_deploy", "reactor/deploy", "ipopt", 40, CRITICS),
-    study("cstr_deploy", "reactor/deploy", "literal", 10, CRITICS),
+    study("cstr_ablation", "reactor/ablation", minutes=35, needs=["cstr_deploy_critics"]),
+    study("cstr_training", "reactor/training", minutes=10, needs=CRITICS),
+    study("cstr_offline", "reactor/offline", minutes=1, needs=["cstr_training"]),
+    study("cstr_offline", "reactor/offline", "ablation", 15, ["cstr_training"]),
+    study("cstr_observers", "reactor/observers", minutes=15, needs=["cstr_offline"]),
+    study("training_speed", "speed/training_speed", "ablation", 15, ["cstr_offline_ablation"]),
+    study("training_speed", "speed/training_speed", "peer", 22, ["training_speed_ablation"]),
+    study("cstr_tune", "reactor/tune", minutes=30, needs=CRITICS),
+    study("cstr_deploy", "reactor/deploy", "ipopt", 20, CRITICS),
+    study("cstr_deploy", "reactor/deploy", "literal", 5, CRITICS),
     study("cstr_deploy", "reactor/deploy", "branching", 5, CRITICS),
+    study("cstr_stuck", "reactor/stuck", minutes=14, needs=CRITICS),
+    study("cstr_estimation", "reactor/estimation", minutes=20, needs=CRITICS),
     study("cstr_shift", "reactor/shift", "plants", 12, CRITICS),
     study("cstr_shift", "reactor/shift", "critic", 2, CRITICS),
     study("cstr_profile", "reactor/trajectories", needs=CRITICS, takes=()),
-    study("linear_scalability", "linear/scalability", "main", 15),
-    study("linear_scalability", "linear/scalability", "sweep", 30, ["linear_scalability_main"]),
-    study("reliability", "trust/reliability", "controllers", 20, CRITICS),
+    study("reliability", "trust/reliability", "controllers", 10, CRITICS),
     study("reliability", "trust/reliability", "training", 10),
     study("reliability", "trust/reliability", "checkpoints", 2),
-    study("reliability", "trust/reliability", "deployments", 15, CRITICS),
+    study("reliability", "trust/reliability", "deployments", 7, CRITICS),
+    study("reliability", "trust/reliability", "determinism", 10, CRITICS),
+    study("linear_scalability", "linear/scalability", "main", 8),
+    study("linear_scalability", "linear/scalability", "sweep", 15, ["linear_scalability_main"]),
+    study("dip_performance", "pendulum/performance", minutes=15),
     study("dip_equilibria", "pendulum/equilibria", minutes=2, takes=()),
-    study("dip_value", "pendulum/learned_value", "equilibria", 1, ["critic_double_pendulum_planner"]),
-    study("reliability", "trust/reliability", "determinism", 10, CRITICS, alone=True),
-    study("dip_value", "pendulum/learned_value", "loops", 20, ["dip_value_train"], alone=True),
-    study("dip_performance", "pendulum/performance", minutes=30, alone=True),
-    study("linear_value_mpc", "linear/value_mpc", "profile", 10, ["linear_value_mpc_train"], alone=True),
-    study("linear_value_mpc", "linear/value_mpc", "scaling", 10, ["linear_value_mpc_train"], alone=True),
-    study("solve_time", "speed/solve_time", minutes=10, needs=CRITICS, alone=True, takes=()),
-    study("training_speed", "speed/training_speed", "profile", 1, **TWO_CORES),
-    study("training_speed", "speed/training_speed", "ablation", 20, ["training_speed_profile"], **TWO_CORES),
-    study("training_speed", "speed/training_speed", "peer", 30, ["training_speed_ablation"], **TWO_CORES),
-    study("embedded", "speed/embedded", minutes=45, needs=CRITICS, alone=True, takes=()),
-    study("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True, takes=RUNS),
+    study("dip_value", "pendulum/learned_value", "ablation", 40),
+    Step("embedded", (*EMBEDDED, "equal", "elsewhere", "draws", "room", "fuzz"), 25, CRITICS, takes=()),
+    Step("embedded_time", (*EMBEDDED, "time", "beside"), 8, CRITICS, alone=True, takes=()),
+    study("linear_value_mpc", "linear/value_mpc", "profile", 4, ["linear_value_mpc_train"], alone=True),
+    study("linear_value_mpc", "linear/value_mpc", "scaling", 4, ["linear_value_mpc_train"], alone=True),
+    study("solve_time", "speed/solve_time", minutes=4, needs=CRITICS, alone=True, takes=()),
+    study("training_speed", "speed/training_speed", "profile", 1, alone=True),
+    study("benchmark_peers", "speed/benchmark_peers", minutes=8, needs=CRITICS, alone=True, takes=("runs",)),
 ]
 
 
@@ -158,25 +150,14 @@ def run(step, args, done):
     """One step, in a process of its own, unless its note `done` is there. Returns what went wrong, or None."""
     if done.exists():
         return None
-    tick, critic = time.time(), step.name.startswith("critic_")
-    command = [sys.executable, *step.command]
-    if critic:
-        trained = args.runs / f"critics/{step.name}_{os.getpid()}"
-        command += ["--out", str(trained)]
-        command += QUICK[step.command[0]].split() if args.quick else []
-    else:
-        command += ["--out", str(args.out)] + ["--quick"] * args.quick
-        command += ["--jobs", str(args.step_jobs)] if "jobs" in step.takes else []
-        command += ["--runs", str(args.runs / "experiments")] if "runs" in step.takes else []
+    tick, command = time.time(), [sys.executable, *step.command, "--out", str(args.out)]
+    command += ["--quick"] * args.quick
+    command += ["--jobs", str(args.step_jobs)] if "jobs" in step.takes else []
+    command += ["--runs", str(args.runs / "experiments")] if "runs" in step.takes else []
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
     result = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", env=one_thread)
     if result.returncode:
         return f"{' '.join(command)}\n{result.stderr.strip()[-2000:]}"
-    if critic:
-        target = args.out / f"pretrained/{step.name.removeprefix('critic_')}.pt"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        next(trained.glob("*/checkpoint.pt")).replace(target)
-        shutil.rmtree(trained)
     write(result.stdout, args.runs / f"logs/{step.name}.txt")
     write(json.dumps({"seconds": time.time() - tick}), done)
 

@@ -125,6 +125,7 @@ TABLE_ALONE = {
     "linear_value_mpc_train",
     "training_speed_profile",
     "embedded",
+    "embedded_time",
 }
 DRAWN = [step for step in reproduce.STEPS if not step.name.startswith(("critic_", "reliability_"))]
 DRAWN = [step for step in DRAWN if step.name not in TABLE_ALONE]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments import reproduce
+from experiments import critics, reproduce
+from experiments.speed import embedded
 
 ROOT = Path(__file__).parent.parent
 
@@ -53,11 +54,18 @@ def test_every_table_and_figure_has_a_step():
         for study in studies:
             plain = path.relative_to(ROOT).as_posix()
             named = f"{plain} --study {study}"
-            assert named in commands or (study in (None, studies[0]) and plain in commands), named
-    trained = {
-        step.name.removeprefix("critic_") for step in reproduce.STEPS if step.name.startswith("critic_")
+            default = study in (None, studies[0]) and plain in commands
+            assert named in commands or default or path.stem == "embedded", named
+    run = {
+        study for step in reproduce.STEPS if step.name.startswith("embedded") for study in step.command[2:]
     }
-    assert trained == {path.stem for path in (ROOT / "experiments/pretrained").glob("*.pt")}
+    assert run == embedded.STUDIES.keys()
+    trained = {step.command[-1] for step in reproduce.STEPS if step.name.startswith("critic_")}
+    assert (
+        trained
+        == critics.CRITICS.keys()
+        == {path.stem for path in (ROOT / "experiments/pretrained").glob("*.pt")}
+    )
 
 
 def test_steps_wait_for_their_needs_and_what_measures_times_runs_by_itself():

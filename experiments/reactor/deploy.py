@@ -29,7 +29,7 @@ from experiments.reactor.tune import TUNED, TUNED_IPOPT
 NOMINAL, ROBUST = dict(controllers=("nominal_mpc",)), dict(controllers=("robust_mpc",))
 IPOPT, ONE, HARD = dict(like="ipopt"), dict(iterations=1), dict(constraints="hard")
 HORIZONS = (0, 1, 2, 5, 10)
-DRAWS = {"deploy": 200, "ipopt": 25, "branching": 20}  # else 50
+DRAWS = {"deploy": 200, "critics": 50}  # else 20
 CONVENTIONS = {
     "this repository's problem": IPOPT,
     "slack summed over scenarios": IPOPT | dict(slack_weight=9.0),
@@ -90,7 +90,7 @@ class Args(common.ParallelArgs):
     """deploy: the controllers against each other; critics: of other training seeds; ipopt: by another solver; literal: conventions of the
     authors' code; branching: trees that branch at more stages"""
     episodes: int | None = None
-    """paired draws; default: 200, of ipopt 25, of branching 20, of the others 50"""
+    """paired draws; default: 200, of critics 50, of the others 20"""
 
 
 def variants(args):
@@ -152,7 +152,7 @@ def main(args):
     name = f"cstr_{args.study}"
     common.check(args, name, episodes=(1, 10**6))
     if not args.plot_only:
-        rows = loops.collect(variants(args), args, args.episodes or DRAWS.get(args.study, 50))
+        rows = loops.collect(variants(args), args, args.episodes or DRAWS.get(args.study, 20))
         common.write(loops.table(rows), args.table(name))
     rows = common.read(args.table(name))
     print_table(rows)

@@ -1,6 +1,6 @@
 """Why robust MPC stays where it is: one problem under two solvers, each given the other's plan, and IPOPT with other Hessians and barriers.
 
-    python experiments/reactor/stuck.py --jobs 2        # a quarter of an hour; continues where it stopped
+    python experiments/reactor/stuck.py --jobs 2        # eight minutes; continues where it stopped
     python experiments/reactor/stuck.py --plot-only     # print the table of the committed CSV
 
 The problem is that of rl_mpc_deploy.py's robust MPC, N = 20 with quadratic cost, hard bounds as exact penalties; objectives are the same
@@ -38,7 +38,7 @@ NEAR = 50.0  # below it IPOPT counts as stuck
 
 @dataclass(frozen=True)
 class Args(common.ParallelArgs):
-    episodes: int = 20
+    episodes: int = 12
     """paired draws"""
 
 

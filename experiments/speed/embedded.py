@@ -1,7 +1,7 @@
 """The controller in C beside the one in Python: the same actions, the same closed loops, how long a step takes, how much room it needs.
 
-    python experiments/speed/embedded.py                    # half an hour in one process: nothing else should run during --study time
-    python experiments/speed/embedded.py --study equal      # one of the studies
+    python experiments/speed/embedded.py --study equal elsewhere draws room fuzz    # a quarter of an hour
+    python experiments/speed/embedded.py --study time beside                        # nothing else should run
 
 `equal`: both in closed loop, each on its own plant, ten draws of 100 steps; the largest difference of an action, in its range. `elsewhere`:
 check.c with 1,000 recorded steps, and the closed loop of example.c, with other flags, by other compilers and for other processors, where

@@ -1,13 +1,13 @@
 """Where the training time of the CSTR agent goes, what its settings buy, and Stable-Baselines3's SAC + HER on the same environment.
 
-    python experiments/speed/training_speed.py --study ablation    # twenty minutes: one setting changed at a time, 5 seeds
-    python experiments/speed/training_speed.py --study peer        # half an hour: Stable-Baselines3 (requirements-dev.txt), 3 seeds
+    python experiments/speed/training_speed.py --study ablation    # ten minutes: one setting changed at a time, 3 seeds
+    python experiments/speed/training_speed.py --study peer        # ten minutes: Stable-Baselines3 (requirements-dev.txt), 3 seeds
     python experiments/speed/training_speed.py --study profile     # a minute: the parts of one update; nothing else should run
     python experiments/speed/training_speed.py --study ablation --plot-only
 
 Runs are told apart by variant and seed and kept, so that a second call continues. Times are of training alone, evaluations left out, one
-thread per run. Writes results/training_speed_NAME.csv for NAME in ablation, peer, profile (ablation and peer: a row per evaluation) and
-figures/training_speed.png, which needs both.
+thread per run, another run beside it. Writes results/training_speed_NAME.csv for NAME in ablation, peer, profile (ablation and peer: a row
+per evaluation) and figures/training_speed.png, which needs both.
 """
 
 import functools
@@ -60,10 +60,8 @@ QUALITIES = (3.0, 2.5, 2.2)  # percent, robust median error
 class Args(common.ParallelArgs):
     study: Literal["ablation", "peer", "profile"] = "ablation"
     """ablation: settings of sac_her_branching.py; peer: Stable-Baselines3; profile: one update, part by part"""
-    seeds: int = 5
-    """training seeds per variant (peer: 3 at most)"""
-    jobs: int = 2
-    """runs at a time, each on one thread"""
+    seeds: int = 3
+    """training seeds per variant"""
 
 
 def in_order(rows):
@@ -73,12 +71,12 @@ def in_order(rows):
 
 
 def ours(args):
-    """Evaluations of every run of sac_her_branching.py; its agents are kept apart, since those of other studies had company."""
+    """Evaluations of every run of sac_her_branching.py."""
     seeds, few = (1, QUICK) if args.quick else (args.seeds, {})
     variants = list(VARIANTS)[: 2 if args.quick else None]
     runs = [(variant, args.seed + i) for i in range(seeds) for variant in variants]
     agents, rows = [VARIANTS[variant] | few | dict(seed=seed) for variant, seed in runs], []
-    for (variant, seed), folder in zip(runs, common.train(agents, args.runs / "alone", args.jobs)):
+    for (variant, seed), folder in zip(runs, common.train(agents, args.runs, args.jobs)):
         noted = without(common.record(folder), "wall_seconds")
         evaluations = common.read(folder / "evaluations.csv")
         rows += [{"variant": variant, "seed": seed} | row | noted for row in evaluations]
@@ -87,7 +85,7 @@ def ours(args):
 
 def peers(args):
     """Evaluations of every run of Stable-Baselines3."""
-    seeds, variants = (1, list(PEERS)[-1:]) if args.quick else (min(args.seeds, 3), PEERS)
+    seeds, variants = (1, list(PEERS)[-1:]) if args.quick else (args.seeds, PEERS)
     todo = [(variant, args.seed + i, args.quick) for i in range(seeds) for variant in variants]
     rows = common.collect(peer, todo, args.runs, args.jobs)
     return in_order([row | {"jobs": args.jobs, "machine": common.machine()} for row in rows])

@@ -9,7 +9,7 @@ a filter left out, a plan must cost no more than its first guess, and the next s
 training: SIGKILL at random moments, then --resume; the end must equal an uninterrupted run, bit for bit.
 checkpoints: damaged and malicious files; each must be refused in one sentence or, where the damage is not to be seen, load as finite
 numbers.
-deployments: 2,000 in one process; memory must not grow.
+deployments: 1,000 in one process; memory must not grow.
 determinism: the whole reproduction on tiny budgets, twice, with one and with two processes in every step; tables must be the same but for
 times.
 
@@ -74,7 +74,7 @@ ANSWERS = {
     "plan": "fell_back",
     "hold": "held",
 }  # rungs of goal_mpc.py
-STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 1,000
+STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of the others 500
 CELL = 500  # steps
 COUNTS = "faults refused wrong cost_rose chances recovered planned fell_back held qp_unsolved".split()
 # columns that may differ from run to run
@@ -224,7 +224,7 @@ def controllers(args):
     rounds = []
     for name in CONTROLLERS:  # one after the other, so that few processes build and compile the same
         for case in (case for case in FAULTS if name in FAULTS[case]):
-            steps = 10 if args.quick else STEPS.get((case, name), 1_000)
+            steps = 10 if args.quick else STEPS.get((case, name), CELL)
             rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
     total = {}
     for row in common.collect(closed_loop, rounds, args.runs, args.jobs):
@@ -420,7 +420,7 @@ def checkpoints(args):
 
 def deployments(args):
     """Controllers built anew from their checkpoint, each for a few steps from a start, to a goal and on a plant of its own."""
-    most, steps, rng, sizes = 20 if args.quick else 2_000, 5, np.random.default_rng(0), []
+    most, steps, rng, sizes = 20 if args.quick else 1_000, 5, np.random.default_rng(0), []
     for i in range(most):
         controller = deploy.build_controller("rl_mpc", deploy.Args())
         x, goal, psi = draw(controller.plant, rng)
