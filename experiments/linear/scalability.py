@@ -61,7 +61,7 @@ class Args(common.ParallelArgs):
     study: Literal["main", "sweep"] = "main"
     """main: the figure of the paper; sweep: n = 2, 8, 32 with one open choice changed at a time"""
     systems: int | None = None
-    """random systems per dimension, of seeds in a row; default: 10, in the sweep 5"""
+    """random systems per dimension, of seeds in a row; default: 10, in the sweep 3"""
     starts: int | None = None
     """initial states per system; default: 10, in the sweep 2"""
 
@@ -208,7 +208,7 @@ def settings_of(args):
     swept = args.study == "sweep"
     if args.quick:
         return {name: SWEEP[name] for name in ("base", "control horizon 5")[: 1 + swept]}, (2, 4), 2, 2
-    systems, starts = args.systems or (5 if swept else 10), args.starts or (2 if swept else 10)
+    systems, starts = args.systems or (3 if swept else 10), args.starts or (2 if swept else 10)
     return SWEEP if swept else {"base": {}}, (2, 8, 32) if swept else DIMENSIONS, systems, starts
 
 

@@ -50,8 +50,6 @@ VARIANTS = {  # of the ablation
     "twice the states": dict(states=12_000),
     "no visited states": dict(visited=0.0),
     "twice the box": dict(box=3.0),
-    "first plans of 15 steps": dict(lookahead=15),
-    "sigma = 1": dict(sigma=1.0),
     "one sweep": dict(sweeps=1),
     "the lower of two": dict(combine="min"),
 }

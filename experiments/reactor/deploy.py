@@ -29,7 +29,7 @@ from experiments.reactor.tune import TUNED, TUNED_IPOPT
 NOMINAL, ROBUST = dict(controllers=("nominal_mpc",)), dict(controllers=("robust_mpc",))
 IPOPT, ONE, HARD = dict(like="ipopt"), dict(iterations=1), dict(constraints="hard")
 HORIZONS = (0, 1, 2, 5, 10)
-DRAWS = {"deploy": 200, "critics": 50}  # else 20
+DRAWS = {"deploy": 200, "critics": 50, "ipopt": 12}  # else 20
 CONVENTIONS = {
     "this repository's problem": IPOPT,
     "slack summed over scenarios": IPOPT | dict(slack_weight=9.0),
@@ -90,7 +90,7 @@ class Args(common.ParallelArgs):
     """deploy: the controllers against each other; critics: of other training seeds; ipopt: by another solver; literal: conventions of the
     authors' code; branching: trees that branch at more stages"""
     episodes: int | None = None
-    """paired draws; default: 200, of critics 50, of the others 20"""
+    """paired draws; default: 200, of critics 50, of ipopt 12, of the others 20"""
 
 
 def variants(args):

@@ -74,7 +74,7 @@ STYLES = {  # of what is drawn: colour, dashes, where its name stands in the pan
 
 @dataclass(frozen=True)
 class Args(common.ParallelArgs):
-    episodes: int = 100
+    episodes: int = 80
     """paired draws; a quarter of them for faults, changes and benchmarks"""
 
 

@@ -20,7 +20,7 @@ from experiments.palette import BLUE, RED
 from experiments.reactor import offline
 
 Args = common.ParallelArgs
-SEEDS = 4  # agents per variant
+SEEDS = 3  # agents per variant
 OBSERVING = dict(observe_mismatch=True, scenario_hold="episode")
 
 

@@ -2,7 +2,7 @@
 what the number of scenarios, branches per transition and a critic per scenario do to it.
 
     python experiments/reactor/offline.py --jobs 2                    # six minutes: 10 training seeds per agent; continues where it stopped
-    python experiments/reactor/offline.py --study ablation --jobs 2   # a quarter of an hour more: 5 seeds per variant
+    python experiments/reactor/offline.py --study ablation --jobs 2   # ten minutes more: 3 seeds per variant
     python experiments/reactor/offline.py --plot-only                 # redraw from the committed CSV
 
 The evaluation is the paper's (envs/agents/evaluation.py): 200 start states, the same for every agent, 50 steps, goal 0.65 mol/l, mean
@@ -50,7 +50,7 @@ class Args(common.ParallelArgs):
     study: Literal["agents", "ablation"] = "agents"
     """agents: the paper's figure; ablation: scenarios, branches, a critic per scenario"""
     seeds: int | None = None
-    """training seeds per agent; default: 10, ablation 5"""
+    """training seeds per agent; default: 10, ablation 3"""
 
 
 # The paper's option 2
@@ -146,7 +146,7 @@ def errors(folders, args, critic=sac.TwinCritic):
 
 
 def collect(args):
-    seeds = args.seeds or (10 if args.study == "agents" else 5)
+    seeds = args.seeds or (10 if args.study == "agents" else 3)
     seeds = range(args.seed, args.seed + (2 if args.quick else seeds))
     if args.study == "agents":
         agents = {(label, seed): {"scenarios": label} for label in AGENTS for seed in seeds}

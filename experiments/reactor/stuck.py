@@ -38,7 +38,7 @@ NEAR = 50.0  # below it IPOPT counts as stuck
 
 @dataclass(frozen=True)
 class Args(common.ParallelArgs):
-    episodes: int = 12
+    episodes: int = 10
     """paired draws"""
 
 

@@ -36,16 +36,11 @@ VARIANTS = {  # of the arguments of sac_her_branching.py
     "default": {},
     "update per 4 transitions": dict(steps_per_update=4),
     "update per 16 transitions": dict(steps_per_update=16),
-    "batch 128": dict(batch_size=128),
     "batch 512": dict(batch_size=512),
-    "batch 512, update per 16": dict(batch_size=512, steps_per_update=16),
-    "batch 1024, update per 32": dict(batch_size=1024, steps_per_update=32),
     "8 plants": dict(num_envs=8),
     "128 plants": dict(num_envs=128),
     "learning rate held at 1e-3": dict(learning_rate=1e-3, learning_rate_end=1.0),
     "tau 0.005": dict(tau=0.005),
-    "4 branches in the targets": dict(branches=4),
-    "half the transitions, update per 4": dict(total_timesteps=50_000, steps_per_update=4),
 }
 PEERS = {  # Stable-Baselines3: plants, updates per step of all plants, learning rate and its end, tau
     "SB3, its own settings": dict(num_envs=1, updates=1, learning_rate=3e-4, end=1.0, tau=0.005),

@@ -307,7 +307,7 @@ def whole(path):
 
 
 def training(args):
-    parts = [(branches, 1 if args.quick else 30, seed) for seed, branches in enumerate((1, 4))]
+    parts = [(branches, 1 if args.quick else 15, seed) for seed, branches in enumerate((1, 4))]
     found = common.collect(killed, parts, args.runs, args.jobs)
     keys = ("kills", "half", "mid_write", "ends", "same")
     kills, half, mid_write, ends, same = (sum(int(row[key]) for row in found) for key in keys)
