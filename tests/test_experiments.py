@@ -23,7 +23,6 @@ TABLES = sorted(path.name for path in (ROOT / "experiments/results").glob("*.csv
 FIGURES = sorted(path.name for path in (ROOT / "experiments/figures").iterdir())
 # measured with the planner before the present one: their columns may differ, and figures that need the new ones are not redrawn
 EARLIER = {
-    "training_speed_ablation",
     "training_speed_peer",
 }
 TEXT = {
