@@ -40,12 +40,12 @@ POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
 }
 # what the figure shows, with where its name stands in the panel of medians and of 5th percentiles
 DRAWN = {
-    "oracle": ((-5, 93.2), (-7.2, 86.5)),
+    "oracle": ((-5, 92.6), (-7.2, 86)),
     "RL+MPC, N = 5": ((0.25, 83.2), (-7.2, 71)),
     "RL+MPC, N = 5, paper's critic": ((-70, 79), (-100, 60)),
-    "robust MPC, N = 20": ((0.25, 73.6), (-9, 1.5)),
-    "robust MPC, tuned, N = 40": ((0.25, 78), (-9, 46)),
-    "RL, constraint-aware": ((0.25, 80.6), (-7.2, 54)),
+    "robust MPC, N = 20": ((0.25, 74.8), (-9, 11)),
+    "robust MPC, tuned, N = 40": ((0.25, 77.5), (-9, 48)),
+    "RL, constraint-aware": ((0.25, 79.5), (-7.2, 62)),
     "RL, paper's": ((-80, 89.5), (-100, 71)),
 }
 
