@@ -327,9 +327,10 @@ def costs(plant, objective, sigma2=None):
     def shaped(cost):
         return -ca.exp(-cost / (2 * sigma2)) if objective == "goal" else cost
 
+    defined = "quadratic", "goal", *(["expert"] if hasattr(plant, "expert_cost") else [])
+    if objective not in defined or not sigma2 > 0:
+        raise ValueError(f"--objective {objective}, sigma^2 {sigma2}: not defined for {plant.ENV_ID}")
     if objective == "expert":
-        if not hasattr(plant, "expert_cost"):
-            raise ValueError(f"--objective expert is not defined for {plant.ENV_ID}; choose another one")
         return ca.Function("stage", [x, goal], [plant.expert_cost(x, ca)], once), None
     if linear:
         stage = ca.Function("stage", [x, u, goal], [shaped(plant.lq_cost(x, u, goal))], once)
@@ -432,9 +433,7 @@ def check(args):
     check_effects(args, unused | {"scenarios": "" if args.robust_horizon else "with --robust-horizon 0"})
     goals = goal_schedule(plant, args.goal, args.steps)
     if args.objective == "expert" and (goals != plant.EVAL_GOAL).any():
-        raise ValueError(
-            f"--objective expert knows the goal {plant.EVAL_GOAL} only; choose goal or quadratic"
-        )
+        raise ValueError(f"--objective expert knows the goal {plant.EVAL_GOAL} only; choose another one")
     return plant, goals
 
 

@@ -265,6 +265,8 @@ class ScenarioMPC(Controller):
             raise ValueError(f"iterations is {iterations!r}; it must be a whole number of at least 0")
         if not (deadline_ms is None or isinstance(deadline_ms, (int, float, np.number)) and deadline_ms > 0):
             raise ValueError(f"deadline_ms is {deadline_ms!r}; it must be a positive number, or None")
+        if not 0 <= discount <= 1:  # nor is nan
+            raise ValueError(f"discount is {discount}; it must lie in [0, 1]")
         self.iterations, self.deadline_ms = iterations, deadline_ms
         scenarios, price, change_weight = checked_problem(plant, scenarios, slack_price, change_weight)
         self.scenarios = scenarios if robust_horizon else scenarios[:1]

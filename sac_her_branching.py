@@ -28,7 +28,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -69,9 +69,9 @@ class Args:
     """where psi is drawn from: the training grid, the nominal plant, or the MPC's scenario set"""
     scenario_hold: Literal["step", "episode"] = "step"
     """how long a scenario lasts: drawn anew at every step, as in the paper, or once per episode"""
-    observe_mismatch: bool = False
+    observe_mismatch: Annotated[bool, tuple[float, ...]] = False
     """let the agent see how the last transition differed from the nominal model, which tells what plant it is on;
-    give --scenario-hold episode too. Lowers the default of --gamma to 0.95"""
+    give --scenario-hold episode too. Lowers the default of --gamma to 0.95. From Python also its scale, (n_x,)"""
     branches: int = 1
     """K, next states per transition whose targets are averaged; 1: the one that the episode follows, as in the paper"""
 
@@ -128,6 +128,7 @@ class Args:
 
     def __post_init__(self):
         """Arguments left out take the plant's value, all of them plain types."""
+        as_annotated(self)
         defaults = DEFAULTS | envs.load(self.env).TRAINING if self.env in envs.names() else {}
         if self.observe_mismatch and defaults:
             defaults["gamma"] = min(defaults["gamma"], 0.95)
@@ -219,7 +220,7 @@ class HERBuffer:
     def __init__(self, args, plant):
         self.rows, self.num_envs = args.buffer_size // args.num_envs, args.num_envs
         self.branches = args.branches if args.branches > 1 else 0  # one is the transition's own next state
-        self.strategy, self.ratio, self.goal_index = args.her_strategy, args.her_ratio, plant.GOAL_INDEX
+        self.strategy, self.ratio, self.goal_index = args.her_strategy, args.her_ratio, list(plant.GOAL_INDEX)
         n_x, n_u, shape = len(plant.X_LOW), len(plant.U_LOW), (self.rows, self.num_envs)
         self.x, self.x_next = torch.zeros(2, *shape, n_x)
         self.u = torch.zeros(*shape, n_u)
@@ -233,6 +234,8 @@ class HERBuffer:
         row = self.now % self.rows
         stored = [(self.x, x), (self.u, u), (self.goal, goal), (self.x_next, x_next)]
         for store, value in stored + ([(self.branch_next, branch_next)] if self.branches else []):
+            if np.shape(value) != store.shape[1:]:
+                raise ValueError(f"a transition has shape {np.shape(value)}, not {tuple(store.shape[1:])}")
             store[row] = torch.as_tensor(value, dtype=torch.float32)
         self.end[row] = self.OPEN
         if done.any():
@@ -466,8 +469,7 @@ def main(args, kind=SAC):
             else:
                 action = agent.explore(obs["observation"], obs["desired_goal"])
             next_obs, _, _, done, infos = vec.step(action)  # `SAC.reward` counts constraints, too
-            # same-step autoreset: where an episode ended, the state that it reached is in final_obs
-            reached = infos.get("final_obs", next_obs)["observation"]
+            reached = envs.reached_states(next_obs, infos)
             goal = obs["desired_goal"]
             buffer.add(obs["observation"], action, goal, reached, infos.get("branch_states"), done)
             obs = next_obs

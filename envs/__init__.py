@@ -47,6 +47,8 @@ measures, `goal_env.py` the environments, `mismatch.py` what agents may observe 
 what the scripts share beside plants.
 """
 
+import ast
+import contextlib
 import importlib
 import inspect
 import re
@@ -55,7 +57,7 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from envs.goal_env import GoalEnv, VectorGoalEnv  # noqa: F401
+from envs.goal_env import GoalEnv, VectorGoalEnv, reached_states  # noqa: F401
 from envs.mismatch import Mismatch  # noqa: F401
 from envs.plant import (  # noqa: F401
     Plant,
@@ -77,15 +79,27 @@ from envs.plant import (  # noqa: F401
 )
 
 
+def _env_id(path):
+    """The text that a module assigns to ENV_ID; None if it does not, or is no file. One that is half written is a plant, too."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+        assigned = [
+            node for node in ast.walk(ast.parse(text)) if isinstance(node, (ast.Assign, ast.AnnAssign))
+        ]
+        text = "\n".join(map(ast.unparse, assigned))
+    except OSError:  # a folder, a link to nothing
+        return None
+    except (SyntaxError, ValueError):
+        pass
+    found = re.search(r"""^[ \t]*ENV_ID\b[^=\n]*=\s*\(?["']([^"']+)["']""", text, re.MULTILINE)
+    return found and found[1]
+
+
 def _ids():
     """{name: ENV_ID} of the plants in this folder (and others on `envs.__path__`), read and not imported: a broken one harms no other."""
-    files = sorted(path for folder in __path__ for path in Path(folder).glob("*.py"))
-    texts = {path.stem: path.read_text(encoding="utf-8", errors="replace") for path in files}
-    found = {
-        name: re.search(r"""^[ \t]*ENV_ID\b[^=\n]*=\s*\(?["']([^"']+)["']""", text, re.MULTILINE)
-        for name, text in texts.items()
-    }
-    return {name: match[1] for name, match in found.items() if match and name != "__init__"}
+    files = sorted(path for folder in __path__ for path in Path(folder).glob("[!.]*.py"))
+    found = {path.stem: _env_id(path) for path in files}
+    return {name: env_id for name, env_id in found.items() if env_id}
 
 
 def names():
@@ -115,9 +129,13 @@ def _load(name, options):
         raise ValueError(
             f"--env {name}: {' and '.join(f'envs/{other}.py' for other in same)} have the same ENV_ID; give one another"
         )
+    if not _registered(name, ids[name]):
+        raise ValueError(
+            f"envs/{name}.py: ENV_ID is {ids[name]!r}; it must be as 'Word/Word-v0', and no other environment's"
+        )
     try:
         module = importlib.import_module(f"{__name__}.{name}")
-    except Exception as error:  # whatever a half-written plant raises
+    except (Exception, SystemExit) as error:  # whatever a half-written plant raises
         raise ValueError(f"envs/{name}.py cannot be imported ({type(error).__name__}: {error})") from error
     known = inspect.signature(module.make).parameters if hasattr(module, "make") else ()
     for option, _ in options:
@@ -126,11 +144,14 @@ def _load(name, options):
     return Plant(module.make(**dict(options)) if hasattr(module, "make") else module, name, options)
 
 
-for _name, _env_id in _ids().items():
-    if _env_id not in gym.registry:
-        gym.register(
-            _env_id,
-            entry_point="envs:GoalEnv",
-            vector_entry_point="envs:VectorGoalEnv",
-            kwargs={"plant": _name},
-        )
+def _registered(name, env_id):
+    """Whether gymnasium knows the plant: it is told, but may refuse the id, or have it already."""
+    if env_id not in gym.registry:
+        with contextlib.suppress(gym.error.Error):
+            made_by = dict(entry_point="envs:GoalEnv", vector_entry_point="envs:VectorGoalEnv")
+            gym.register(env_id, **made_by, kwargs={"plant": name})
+    return env_id in gym.registry and gym.registry[env_id].kwargs.get("plant") == name
+
+
+for _name, _id in _ids().items():
+    _registered(_name, _id)

@@ -12,9 +12,7 @@ from envs.plant import goal_reward, sample_states
 class _PlantSpaces:
     """Spaces and observation layout that the single and the batched environment share."""
 
-    def _set_plant(
-        self, plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
-    ):
+    def _set_plant(self, plant, options, scenarios, scenario_hold, max_episode_steps, reward_shape):
         from envs import load
 
         self.plant = load(plant, **options)
@@ -24,7 +22,15 @@ class _PlantSpaces:
         if scenarios not in self.plant.SCENARIOS:
             raise ValueError(f"scenarios={scenarios!r} is not one of {', '.join(self.plant.SCENARIOS)}")
         self.scenarios = self.plant.SCENARIOS[scenarios]
-        self.reward_shape = (smooth_reward, reward_sigma2, reward_tolerance)
+        self.reward_shape = reward_shape  # smooth_reward, reward_sigma2, reward_tolerance
+        self.max_episode_steps = self.plant.EPISODE_STEPS if max_episode_steps is None else max_episode_steps
+        for name, value in (
+            ("max_episode_steps", self.max_episode_steps),
+            ("reward_sigma2", reward_shape[1]),
+            ("reward_tolerance", reward_shape[2]),
+        ):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} is {value}; it must be positive")
 
         def box(low, high):
             return gym.spaces.Box(np.float64(low), np.float64(high), dtype=np.float64)
@@ -53,8 +59,12 @@ class _PlantSpaces:
 
     def _clip(self, action, shape):
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != shape or not np.isfinite(action).all():
-            raise ValueError(f"action is {action.tolist()}; it must be finite, of shape {shape}")
+        if action.shape != shape:
+            raise ValueError(f"action has shape {action.shape}; it must be {shape}")
+        if not np.isfinite(action).all():
+            raise ValueError(
+                f"{(~np.isfinite(action)).sum()} of {action.size} numbers of the action are not finite"
+            )
         return np.clip(action, self.plant.U_LOW, self.plant.U_HIGH)
 
     def _options(self, options, shape):
@@ -71,10 +81,30 @@ class _PlantSpaces:
                     raise ValueError(
                         f"reset: {name} is {value.tolist()}; it must be finite, of shape {(*shape, n)}"
                     )
+                if (
+                    name == "goal"
+                    and not ((self.plant.GOAL_LOW <= value) & (value <= self.plant.GOAL_HIGH)).all()
+                ):
+                    box = f"{self.plant.GOAL_LOW.tolist()} to {self.plant.GOAL_HIGH.tolist()}"
+                    raise ValueError(f"reset: goal is {value.tolist()}; it must lie in {box}")
                 if name == "state" and isinstance(self.plant, Mismatch):  # none yet
                     value = np.concatenate([value, np.zeros_like(value)], axis=-1)
                 found[name] = np.broadcast_to(value, (*shape, value.shape[-1])).copy()
         return found
+
+
+def reached_states(next_obs, infos):
+    """The states (num_envs, n_x) that a step of a vector environment reached; where an episode ended they are in final_obs.
+
+    That is a batch of observations here, and an array of single ones in gymnasium's own vector environments.
+    """
+    final = infos.get("final_obs", next_obs)
+    if isinstance(final, dict):
+        return final["observation"]
+    reached = np.array(next_obs["observation"])
+    for i in np.flatnonzero(infos["_final_obs"]):
+        reached[i] = final[i]["observation"]
+    return reached
 
 
 class GoalEnv(_PlantSpaces, gym.Env):
@@ -99,10 +129,8 @@ class GoalEnv(_PlantSpaces, gym.Env):
         render_mode=None,
         **options,
     ):
-        self._set_plant(
-            plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
-        )
-        self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
+        reward_shape = smooth_reward, reward_sigma2, reward_tolerance
+        self._set_plant(plant, options, scenarios, scenario_hold, max_episode_steps, reward_shape)
         self.observation_space, self.action_space = self._single_observation_space, self._single_action_space
 
     def reset(self, *, seed=None, options=None):
@@ -150,11 +178,11 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
         render_mode=None,
         **options,
     ):
-        self._set_plant(
-            plant, options, scenarios, smooth_reward, reward_sigma2, reward_tolerance, scenario_hold
-        )
+        reward_shape = smooth_reward, reward_sigma2, reward_tolerance
+        self._set_plant(plant, options, scenarios, scenario_hold, max_episode_steps, reward_shape)
+        if num_envs < 1 or branches < 0:
+            raise ValueError(f"num_envs is {num_envs}, branches {branches}; they must be at least 1 and 0")
         self.num_envs, self.branches = num_envs, branches
-        self.max_episode_steps = max_episode_steps or self.plant.EPISODE_STEPS
         self.single_observation_space = self._single_observation_space
         self.single_action_space = self._single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -163,6 +191,10 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
+        if mask is not None and (np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool):
+            raise ValueError(
+                f"reset: reset_mask is {mask}; it must be True or False for each of {self.num_envs}"
+            )
         if mask is None:
             self.x = np.empty((self.num_envs, len(self.plant.X_LOW)))
             self.goal = np.empty((self.num_envs, len(self.plant.GOAL_INDEX)))

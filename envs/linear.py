@@ -32,7 +32,8 @@ class Linear:
     def __init__(self, a, transform=None):
         n = len(a)
         one = np.ones(n)
-        self.A, self.B, self.transform = a, np.eye(n), np.eye(n) if transform is None else transform
+        self.A, self.B = np.array(a, dtype=float), np.eye(n)
+        self.transform = np.eye(n) if transform is None else np.array(transform, dtype=float)
         self.STATE_NAMES, self.STATE_UNITS = tuple(f"x_{i + 1}" for i in range(n)), ("-",) * n
         self.ACTION_NAMES, self.ACTION_UNITS = tuple(f"u_{i + 1}" for i in range(n)), ("-",) * n
         self.X_LOW, self.X_HIGH = -STATE_BOUND * one, STATE_BOUND * one
@@ -72,7 +73,7 @@ class Linear:
             self.solved[gamma] = discounted_lqr(
                 self.A, self.B, np.eye(len(self.A)), np.eye(len(self.A)), gamma
             )
-        return self.solved[gamma]
+        return tuple(part.copy() for part in self.solved[gamma])
 
     def held_action(self, goal):
         """The action that holds a goal, (I - A) g: the linear-quadratic costs count deviations from it."""

@@ -5,6 +5,16 @@ import numpy as np
 from envs.plant import sample_states
 
 
+def checked_scale(plant, scale):
+    """A new array (n_x,). Raises ValueError for another shape, or what is not positive."""
+    scale = np.array(scale, dtype=float)
+    if scale.shape != plant.X_LOW.shape or not ((scale > 0) & (scale < np.inf)).all():
+        raise ValueError(
+            f"scale of the mismatch is {scale.tolist()}; it must be {len(plant.X_LOW)} positive numbers"
+        )
+    return scale
+
+
 class Mismatch:
     """A plant whose observation (2 n_x,) is its state and how the last transition differed from the nominal model, zero at the first step:
 
@@ -18,7 +28,7 @@ class Mismatch:
         if not hasattr(plant, "MISMATCH_SCALE"):
             raise ValueError(f"--observe-mismatch: {plant.ENV_ID} has no MISMATCH_SCALE")
         self.plant, n = plant, len(plant.X_LOW)
-        self.MISMATCH_SCALE = plant.MISMATCH_SCALE if scale is None else np.array(scale)
+        self.MISMATCH_SCALE = checked_scale(plant, plant.MISMATCH_SCALE if scale is None else scale)
         extra = {
             "X_LOW": -np.inf,
             "X_HIGH": np.inf,

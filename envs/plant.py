@@ -47,12 +47,21 @@ def grid(*values):
 
 REQUIRED = ["ENV_ID", "DT", "STATE_NAMES", "STATE_UNITS", "X_LOW", "X_HIGH", "ACTION_NAMES", "ACTION_UNITS"]
 REQUIRED += ["U_LOW", "U_HIGH", "GOAL_INDEX", "TRAIN_GOALS", "EVAL_GOAL"]
+# numbers per state, action, parameter and goal; of those with a star any number of rows
+SHAPES = {"n_x": "X_LOW X_HIGH INIT_LOW INIT_HIGH OBS_LOW OBS_HIGH START START_NOISE MISMATCH_SCALE"}
+SHAPES |= {"n_u": "U_LOW U_HIGH", "n_psi": "PSI_NOMINAL PSI_LOW PSI_HIGH", "*n_psi": "EVAL_PSI"}
+SHAPES |= {"n_goal": "EVAL_GOAL GOAL_LOW GOAL_HIGH ERROR_SCALE", "*n_goal": "TRAIN_GOALS"}
+SHAPES = {name: shape for shape, names in SHAPES.items() for name in names.split()}
+POSITIVE = "DT ERROR_SCALE REWARD_SIGMA2 REWARD_TOLERANCE MPC_SIGMA2 METRIC_SIGMA2 MISMATCH_SCALE".split()
+WHOLE = "EPISODE_STEPS", "MODEL_SUBSTEPS"
+MAY_BE_INFINITE = "X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH"
 
 
 class Plant:
     """A plant module, or what its `make` returns, with what it leaves out; see `envs/__init__.py` for the names.
 
-    Raises ValueError, one sentence, for a name that is missing, of the wrong shape or out of order.
+    It holds copies: arrays of floats, indices as lists. Raises ValueError, one sentence, for a name that is missing, of the wrong shape or
+    out of order.
     """
 
     def __init__(self, source, name, options=()):
@@ -61,19 +70,32 @@ class Plant:
         missing += [] if hasattr(source, "ode") or hasattr(source, "next_state") else ["ode"]
         if missing:
             raise ValueError(f"envs/{name}.py lacks {', '.join(missing)}")
-        _check(source, name)
-        self.defaults = _defaults(source)
-        self.BENCHMARK = self.defaults["BENCHMARK"] | getattr(source, "BENCHMARK", {})  # may name some of it
+        vars(self).update(_given(source, name))
+        _check(self, name)
+        defaults = _defaults(self)
+        self.simulated = getattr(source, "step", None) or defaults.pop("step")
+        benchmark = defaults["BENCHMARK"] | getattr(source, "BENCHMARK", {})  # may name some of it
+        vars(self).update({k: v for k, v in defaults.items() if not hasattr(self, k)}, BENCHMARK=benchmark)
         _check(self, name)
         _try_a_step(self)
 
+    def step(self, x, u, psi=None, *more, **options):
+        """State one sampling time later, (..., n_x), of x (..., n_x), u (..., n_u), psi (..., n_psi) or the nominal ones.
+
+        What else is given the plant's own `step` gets. Raises ValueError for another number of states, actions or parameters, which numpy
+        might broadcast.
+        """
+        psi = self.PSI_NOMINAL if psi is None else psi
+        for name, value, like in (("x", x, self.X_LOW), ("u", u, self.U_LOW), ("psi", psi, self.PSI_NOMINAL)):
+            if np.shape(value)[-1:] != like.shape:
+                raise ValueError(f"{name} has shape {np.shape(value)}; {self.ENV_ID} has {len(like)}")
+        return self.simulated(x, u, psi, *more, **options)
+
     def __getattr__(self, name):
-        if name in ("source", "defaults") or name.startswith("__"):  # not yet there, while it is copied
+        if name == "source" or name.startswith("__"):  # not yet there, while it is copied
             raise AttributeError(name)
         if hasattr(self.source, name):
             return getattr(self.source, name)
-        if name in self.defaults:
-            return self.defaults[name]
         raise AttributeError(f"plant {self.name} has no {name}")
 
     def __reduce__(self):
@@ -89,15 +111,45 @@ def _reload(load, name, options):
     return load(name, **options)
 
 
+def _floats(value):
+    return np.array(value, dtype=float)
+
+
+def _texts(value):
+    return (value,) if isinstance(value, str) else tuple(value)
+
+
+COPIES = dict.fromkeys(SHAPES, _floats)
+COPIES |= dict.fromkeys(("GOAL_INDEX", "ANGLES"), lambda value: np.atleast_1d(value).tolist())
+COPIES |= dict.fromkeys(("STATE_NAMES", "STATE_UNITS", "ACTION_NAMES", "ACTION_UNITS"), _texts)
+COPIES |= dict.fromkeys(("MEASURED", "PSI_NAMES"), _texts)
+COPIES |= dict.fromkeys(("SCENARIOS", "GOALS"), lambda sets: {k: _floats(v) for k, v in sets.items()})
+
+
+def _given(source, name):
+    """Copies of the constants that a plant's source has, in the types that everything else relies on."""
+    found = {}
+    for each in filter(lambda each: hasattr(source, each), COPIES):
+        value = getattr(source, each)
+        try:
+            found[each] = COPIES[each](value)
+        except (TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"envs/{name}.py: {each} is {value!r} ({error})") from None
+    return found
+
+
 def _defaults(p):
     """Of every name that a plant need not have, its value."""
-    given = lambda name, default: np.asarray(getattr(p, name, default), dtype=float)  # noqa: E731
+    given = lambda name, default: np.array(getattr(p, name, default), dtype=float)  # noqa: E731
     init_low, init_high = given("INIT_LOW", p.X_LOW), given("INIT_HIGH", p.X_HIGH)
     with np.errstate(invalid="ignore"):  # infinite boxes are refused below
         half, middle = (init_high - init_low) / 2, (init_low + init_high) / 2
-    index, angles = list(p.GOAL_INDEX), list(getattr(p, "ANGLES", []))
-    scale = given("ERROR_SCALE", 0.05 * half[index])
+    index, angles = p.GOAL_INDEX, getattr(p, "ANGLES", [])
     goal_low, goal_high = given("GOAL_LOW", init_low[index]), given("GOAL_HIGH", init_high[index])
+    wide = np.where(
+        half[index] > 0, half[index], (goal_high - goal_low) / 2
+    )  # a state may start at one value
+    scale = given("ERROR_SCALE", 0.05 * wide)
     width, turning = float(np.mean(scale)), np.isin(index, angles)
 
     nominal = given("PSI_NOMINAL", [])
@@ -123,7 +175,7 @@ def _defaults(p):
 
     def percentage_error(achieved, goal):
         error = np.where(turning, (achieved - goal + np.pi) % (2 * np.pi) - np.pi, achieved - goal)
-        return (100 * np.abs(error) / np.where(turning, np.pi, half[index])).mean(-1)
+        return (100 * np.abs(error) / np.where(turning, np.pi, wide)).mean(-1)
 
     values = dict(
         EPISODE_STEPS=50,
@@ -179,54 +231,63 @@ def _defaults(p):
 def _check(p, name):
     """Shapes, order and finite numbers of the names that p has."""
     n_x, n_u, n_goal = len(p.STATE_NAMES), len(p.ACTION_NAMES), len(p.GOAL_INDEX)
-    n_psi = np.size(getattr(p, "PSI_NOMINAL", []))
+    sizes = {"n_x": n_x, "n_u": n_u, "n_goal": n_goal, "n_psi": np.size(getattr(p, "PSI_NOMINAL", []))}
 
     def refuse(sentence):
         raise ValueError(f"envs/{name}.py: {sentence}")
 
-    if not (np.isscalar(p.DT) and p.DT > 0):
-        refuse(f"DT is {p.DT!r}; it must be a positive number")
-    for names, units, n in (("STATE_NAMES", "STATE_UNITS", n_x), ("ACTION_NAMES", "ACTION_UNITS", n_u)):
-        if len(getattr(p, units)) != n:
-            refuse(f"{units} are {len(getattr(p, units))}, {names} {n}")
+    # names and indices
+    for names, units in (("STATE_NAMES", "STATE_UNITS"), ("ACTION_NAMES", "ACTION_UNITS")):
+        if len(getattr(p, units)) != len(getattr(p, names)):
+            refuse(f"{units} are {len(getattr(p, units))}, {names} {len(getattr(p, names))}")
+        if len(set(getattr(p, names))) < len(getattr(p, names)):
+            refuse(f"{names} is {getattr(p, names)}; each may be there once")
     if not set(getattr(p, "MEASURED", ())) <= set(p.STATE_NAMES):
         refuse(f"MEASURED is {p.MEASURED}; it must be names of states")
     for each in ("GOAL_INDEX", "ANGLES"):
-        if not all(isinstance(i, (int, np.integer)) and 0 <= i < n_x for i in getattr(p, each, ())):
-            refuse(f"{each} is {getattr(p, each)}; it must be indices of the {n_x} states")
-    lengths = dict.fromkeys(
-        ("X_LOW", "X_HIGH", "INIT_LOW", "INIT_HIGH", "OBS_LOW", "OBS_HIGH", "START", "START_NOISE"), n_x
-    )
-    lengths |= dict.fromkeys(("U_LOW", "U_HIGH"), n_u) | dict.fromkeys(
-        ("PSI_NOMINAL", "PSI_LOW", "PSI_HIGH"), n_psi
-    )
-    lengths |= dict.fromkeys(("EVAL_GOAL", "GOAL_LOW", "GOAL_HIGH", "ERROR_SCALE"), n_goal)
-    arrays = {each: (getattr(p, each), (n,)) for each, n in lengths.items() if hasattr(p, each)}
-    arrays["TRAIN_GOALS"] = p.TRAIN_GOALS, (None, n_goal)
-    arrays |= {
-        f"SCENARIOS[{each!r}]": (value, (None, n_psi)) for each, value in getattr(p, "SCENARIOS", {}).items()
-    }
-    arrays |= {"EVAL_PSI": (p.EVAL_PSI, (None, n_psi))} if hasattr(p, "EVAL_PSI") else {}
+        found = getattr(p, each, [])
+        whole = isinstance(found, list) and all(type(i) is int and 0 <= i < n_x for i in found)
+        if not whole or len(set(found)) < len(found):
+            refuse(f"{each} is {found}; it must be different indices of the {n_x} states")
+
+    # arrays
+    arrays = {each: (getattr(p, each), shape) for each, shape in SHAPES.items() if hasattr(p, each)}
+    arrays |= {f"SCENARIOS[{k!r}]": (value, "*n_psi") for k, value in getattr(p, "SCENARIOS", {}).items()}
+    arrays |= {f"GOALS[{k!r}]": (value, "n_goal") for k, value in getattr(p, "GOALS", {}).items()}
+    if hasattr(p, "GOAL_REACHABLE"):
+        arrays |= {f"GOAL_REACHABLE[{k}]": (p.GOAL_REACHABLE[k], "n_goal") for k in (0, 1)}
     for each, (value, shape) in arrays.items():
-        value = np.asarray(value, dtype=float)
-        if (
-            value.ndim != len(shape)
-            or not len(value)
-            and shape[0] is None
-            or any(n not in (m, None) for n, m in zip(shape, value.shape))
-        ):
-            refuse(f"{each} has shape {value.shape}; it must be {shape}".replace("None", "any"))
-        if (
-            np.isnan(value).any()
-            or not np.isfinite(value).all()
-            and each not in ("X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH")
-        ):
+        value, n, rows = np.asarray(value, dtype=float), sizes[shape.strip("*")], shape[0] == "*"
+        if value.ndim != 1 + rows or value.shape[-1] != n or not len(value) and rows:
+            refuse(f"{each} has shape {value.shape}; it must be {f'(any, {n})' if rows else (n,)}")
+        if np.isnan(value).any() or not np.isfinite(value).all() and each not in MAY_BE_INFINITE:
             hint = "; give INIT_LOW and INIT_HIGH, where episodes start" * each.startswith("INIT")
             refuse(f"{each} is {value.tolist()}; it must be finite{hint}")
-    for box in ("X", "INIT", "OBS", "U", "GOAL"):
-        low, high = (np.asarray(getattr(p, f"{box}_{end}", 0.0), dtype=float) for end in ("LOW", "HIGH"))
+
+    # numbers
+    for each in POSITIVE:
+        value = np.asarray(getattr(p, each, 1.0))
+        if value.dtype.kind not in "if" or not (value > 0).all():
+            refuse(f"{each} is {value.tolist()!r}; it must be positive")
+    for each in WHOLE:
+        value = getattr(p, each, 1)
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            refuse(f"{each} is {value!r}; it must be a whole number of at least 1")
+
+    # order
+    inside = {"X": (), "U": (), "INIT": (), "OBS": ("INIT_LOW", "INIT_HIGH"), "PSI": ("PSI_NOMINAL",)}
+    inside |= {"GOAL": ("EVAL_GOAL", "TRAIN_GOALS")}
+    for box, names in inside.items():
+        low, high = getattr(p, f"{box}_LOW", None), getattr(p, f"{box}_HIGH", None)
+        if (low is None) != (high is None):
+            refuse(f"{box}_LOW and {box}_HIGH belong together")
+        if low is None:
+            continue
         if (low > high).any() or box == "U" and (low == high).any():
             refuse(f"{box}_LOW is {low.tolist()}, {box}_HIGH {high.tolist()}; they are not in order")
+        for each in filter(lambda each: hasattr(p, each), names):
+            if not ((low <= getattr(p, each)) & (getattr(p, each) <= high)).all():
+                refuse(f"{each} is not within {box}_LOW {low.tolist()} and {box}_HIGH {high.tolist()}")
     unknown = set(getattr(p, "BENCHMARK", {})) - {"horizon", "slack_price", "change_weight"}
     if unknown:
         refuse(f"BENCHMARK has {', '.join(sorted(unknown))}; it takes horizon, slack_price and change_weight")
@@ -317,6 +378,12 @@ def scenario_set(plant, name):
 
 def goal_reward(plant, achieved, goal, smooth=True, sigma2=None, tolerance=None, xp=np):
     """Reward of reaching `achieved` under `goal`, both (..., n_goal): Gaussian (eq:goalreward), or 0/1 (eq:sparsereward)."""
+    n = (len(plant.GOAL_INDEX),)
+    if np.shape(achieved)[-1:] != n or np.shape(goal)[-1:] != n:
+        shapes = f"{tuple(np.shape(achieved))} and {tuple(np.shape(goal))}"
+        raise ValueError(
+            f"achieved and desired goal have shapes {shapes}; {plant.ENV_ID} has {n[0]} per goal"
+        )
     error = plant.goal_error(achieved, goal, xp)
     if smooth:
         return xp.exp(-(error**2).sum(-1) / (2 * (plant.REWARD_SIGMA2 if sigma2 is None else sigma2)))

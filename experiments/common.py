@@ -6,6 +6,7 @@ call of the same command continues, and a change of the code makes everything ne
 
 import contextlib
 import csv
+import functools
 import hashlib
 import importlib
 import inspect
@@ -28,7 +29,7 @@ import tyro
 from scipy.stats import bootstrap, trim_mean
 from tqdm import tqdm
 
-from envs.script.arguments import check_ranges
+from envs.script.arguments import as_annotated, check_ranges
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -85,6 +86,7 @@ def check(args, table, **ranges):
     """Refuse arguments outside their (least, most), folders that cannot be written, and --plot-only where `table` is not there."""
     ranges |= {"seed": (0, 10**9)} | ({"jobs": (1, 1024)} if hasattr(args, "jobs") else {})
     try:
+        as_annotated(args)
         check_ranges(args, **ranges)
     except ValueError as error:
         fail(error)
@@ -127,6 +129,12 @@ def digest(places, *words):
     places = [part if isinstance(part, Path) else Path(inspect.getfile(part)).resolve() for part in places]
     code = [text for path, text in CODE.items() if any(path.is_relative_to(place) for place in places)]
     return hashlib.sha256(b"".join([*code, repr(words).encode()])).hexdigest()[:12]
+
+
+@functools.cache
+def checksum(path):
+    """Short hash of a file's contents, for cells that read it."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
 
 
 def each(function, cells, jobs, unit, finished=0):

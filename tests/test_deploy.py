@@ -712,6 +712,8 @@ def test_a_wrong_angle_is_forgotten(glitches):
         (dict(scenarios=np.full((1, 2), np.nan)), "finite"),
         (dict(change_weight=np.inf), "change_weight is inf"),
         (dict(slack_price=np.nan), "slack_price is nan"),
+        (dict(discount=np.nan), "discount is nan"),
+        (dict(discount=-1.0), "discount is -1.0"),
     ],
 )
 def test_the_planner_refuses_what_is_no_setting(wrong, words):
@@ -1063,6 +1065,12 @@ def test_the_constructor_refuses_what_cannot_work(wrong, words):
         ("actor", dict(goal=(0.5, 0.5)), "goal"),
         ("goal_mpc", dict(horizon=0, controllers=("goal_mpc",)), "--horizon"),
         ("rl_mpc", dict(controllers=()), "--controllers"),
+        ("rl_mpc", dict(controllers=("rl-mpc",)), "--controllers.*choose one of actor.*rl_mpc"),
+        ("rl_mpc", dict(horizon="2"), "--horizon is '2'; it must be a whole number"),
+        ("rl_mpc", dict(seed=1.5), "--seed is 1.5; it must be a whole number"),
+        ("rl_mpc", dict(offset_free="yes"), "--offset-free is 'yes'; it must be True or False"),
+        ("rl_mpc", dict(critic=3), "--critic is 3; it must be a path"),
+        ("rl_mpc", dict(goal=("a",)), "--goal is .'a',.; it must be a number"),
         ("rl_mpc", dict(env="reactor"), "reactor.*cstr"),
     ],
 )

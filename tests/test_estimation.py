@@ -420,3 +420,22 @@ def test_particles_that_go_astray_are_dropped():
         found = estimator.update(x + 0.02 * rng.normal(size=1), u)
         restarts, before, x = restarts + estimator.report["restarted"], x, plant.step(x, u, np.array([1.3]))
     assert restarts == 0 and abs(found[0] - before[0]) < 0.05
+
+
+@pytest.mark.parametrize("kind", [Measured, KalmanFilter, ParticleFilter])
+def test_estimators_refuse_what_numpy_would_broadcast(kind):
+    estimator = kind(cstr)
+    for y, u in (
+        ([1.0], cstr.U_LOW),
+        (cstr.START, 5.0),
+        (cstr.START, [5.0]),
+        (np.tile(cstr.START, (2, 1)), cstr.U_LOW),
+    ):
+        with pytest.raises(ValueError, match="has shape"):
+            estimator.update(np.array(y), u)
+    for scale in ([1.0, 2.0], np.zeros(4)):
+        with pytest.raises(ValueError, match="scale of the mismatch"):
+            kind(cstr, mismatch_scale=scale)
+    assert KalmanFilter(cstr, "c_B", compile=False).measured.tolist() == [1]
+    with pytest.raises(ValueError, match="particles is 0"):
+        ParticleFilter(cstr, particles=0)

@@ -257,6 +257,13 @@ def test_hard_bounds_hold_in_a_tree_from_the_first_prediction_on():
     assert mpc.stats["rung"] in ("solved", "retry")
 
 
+def test_an_objective_that_is_none_is_refused():
+    """Once a capital letter gave the quadratic one."""
+    for wrong in (("Goal",), ("goal", 0.0), ("goal", -1.0), ("goal", np.nan)):
+        with pytest.raises(ValueError, match="not defined for RLMPC/CSTR-v0"):
+            gm.costs(envs.load("cstr"), *wrong)
+
+
 def test_the_guides_closed_loop_is_the_first_guess():
     from experiments.pendulum.performance import Guided
 

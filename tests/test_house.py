@@ -78,6 +78,19 @@ def test_arguments_from_python_are_those_of_the_command_line():
     assert args == deploy.Args(
         out=Path("x"), critic=Path("x.pt"), goal=(0.6,), change_weight=(1.0, 2.0), seed=3
     )
+    given = training.Args(num_envs=16.0, hidden=(np.int64(8), 8.0), learning_rate=np.array(1e-3), out="x")
+    assert given == training.Args(num_envs=16, hidden=(8, 8), learning_rate=1e-3, out=Path("x"))
+    for goal in (0.7, [0.7], np.array([0.7]), np.float64(0.7), "0.7"):
+        assert goal_mpc.Args(env="cstr", goal=goal) == goal_mpc.Args(env="cstr", goal=("0.7",))
+    for wrong in (
+        dict(num_envs=16.5),
+        dict(seed=True),
+        dict(hidden=("8",)),
+        dict(smooth_reward="no"),
+        dict(out=3),
+    ):
+        with pytest.raises(ValueError, match="it must be"):
+            training.Args(**wrong)
     assert hash(args) and deploy.Args(goal=0.6).goal == (0.6,)
     assert goal_mpc.Args(goal="0.7", out="x") == goal_mpc.Args(goal=("0.7",), out=Path("x"))
     assert training.Args(hidden=[32, 16], out="x").hidden == (32, 16)
@@ -148,6 +161,6 @@ def test_the_action_that_a_plant_gets_now_can_be_told():
         loops.append(mpc.make_step(envs.load("cstr").START))
         np.testing.assert_array_equal(mpc.reset(u=u) or mpc.u_before, np.zeros(2) if u is None else u)
     assert np.abs(loops[0] - loops[1]).max() > 0
-    for bad in ([1.0], [np.nan, 0.0]):
+    for bad in ([1.0], [np.nan, 0.0], [[80.0], [-1000.0]]):
         with pytest.raises(ValueError, match="u is"):
             mpc.reset(u=bad)

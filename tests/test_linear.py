@@ -477,3 +477,14 @@ def test_bad_arguments_get_one_sentence(script, arguments, words, capsys):
         module.check(tyro.cli(module.Args, args=arguments))
     sentence = capsys.readouterr().err + str(refusal.value)
     assert all(word in sentence for word in words), sentence
+
+
+def test_a_plants_matrices_are_its_own():
+    a = 0.5 * np.eye(2)
+    plant = linear.Linear(a, a)
+    p = plant.lqr()[0]
+    expected = p.copy()
+    a[:] = p[:] = 9
+    np.testing.assert_array_equal(plant.A, 0.5 * np.eye(2))
+    np.testing.assert_array_equal(plant.transform, 0.5 * np.eye(2))
+    np.testing.assert_array_equal(plant.lqr()[0], expected)

@@ -5,6 +5,7 @@ import importlib
 import pickle
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -118,6 +119,99 @@ def test_a_plant_that_is_wrong_is_refused_by_name_and_harms_no_other(folder, num
     assert envs.load("cstr").name == "cstr" and name in envs.names()
 
 
+ADDED = {
+    "INIT_LOW, INIT_HIGH, GOAL_LOW, GOAL_HIGH = [0.5, -1], [0.5, 1], [0.5], [0.5]; TRAIN_GOALS, EVAL_GOAL = [[0.5]], [0.5]": (
+        "ERROR_SCALE is .0.0.; it must be positive"
+    ),
+    "ERROR_SCALE = [-1.0]": "ERROR_SCALE is .-1.0.; it must be positive",
+    "MISMATCH_SCALE = [0.1]": "MISMATCH_SCALE has shape",
+    "METRIC_SIGMA2 = 0": "METRIC_SIGMA2 is 0; it must be positive",
+    "MPC_SIGMA2 = 'wide'": "MPC_SIGMA2 is 'wide'; it must be positive",
+    "EPISODE_STEPS = 0": "EPISODE_STEPS is 0; it must be a whole number",
+    "MODEL_SUBSTEPS = 1.5": "MODEL_SUBSTEPS is 1.5; it must be a whole number",
+    "GOAL_INDEX = [0.0]": "GOAL_INDEX is .0.0.; it must be different indices",
+    "MEASURED = 'x'": "MEASURED is",
+    "STATE_NAMES = 'p', 'p'": "STATE_NAMES is .*each may be there once",
+    "GOALS = {'far': [0.1, 0.2]}": "GOALS.'far'. has shape",
+    "GOAL_LOW, GOAL_HIGH = [0.0], [0.6]": "EVAL_GOAL is not within GOAL_LOW",
+    "GOAL_LOW = [0.0]": "GOAL_LOW and GOAL_HIGH belong together",
+    "OBS_LOW, OBS_HIGH = [-1, -1], [1, 1]": "INIT_LOW is not within OBS_LOW",
+    "PSI_NOMINAL, PSI_LOW, PSI_HIGH = [2.0], [0.0], [1.0]": "PSI_NOMINAL is not within PSI_LOW",
+    "X_LOW = 'low'": "X_LOW is 'low'",
+    "SCENARIOS = [1.0]": "SCENARIOS is",
+    "def step(x, u, psi):\n    return x[:1]": "step at START gives",
+    "raise SystemExit": "cannot be imported .SystemExit",
+    "ENV_ID = 'A plant'": "ENV_ID is 'A plant'; it must be as 'Word/Word-v0'",
+    "ENV_ID = 'RLMPC/' + 'Tank-v0'": "ENV_ID is 'RLMPC/'; it must be as",
+    "ENV_ID = 'CartPole-v1'": "ENV_ID is 'CartPole-v1'; .* no other environment's",
+}
+
+
+@pytest.mark.parametrize("number", range(len(ADDED)))
+def test_a_name_that_is_wrong_is_refused_by_name(folder, number):
+    line, words = list(ADDED.items())[number]
+    text = (
+        SMALLEST.replace('ENV_ID, DT = "Test/{name}-v0", 0.1', "DT = 0.1") if "ENV_ID" in line else SMALLEST
+    )
+    with pytest.raises(ValueError, match=words) as error:
+        envs.load(folder(f"added_{number}", text=f"{text}\n{line}\n"))
+    assert "\n" not in str(error.value) and f"envs/added_{number}.py" in str(error.value)
+    assert envs.load("cstr").name == "cstr"
+
+
+def test_lists_and_numpys_numbers_make_the_same_plant(folder, tmp_path):
+    """Whatever a plant names its constants with, they are copies, and what is trained on it is plain data."""
+    import sac_her_branching as training
+
+    text = SMALLEST.replace(
+        "GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL = [0]", "GOAL_INDEX, TRAIN_GOALS, EVAL_GOAL = np.array([0])"
+    )
+    text = text.replace("np.array([-2.0, -1.0]), np.array([2.0, 1.0])", "[-2, -1], (2, 1)").replace(
+        "np.array([0.7])", "[0.7]"
+    )
+    plant = envs.load(folder("lists", text=text))
+    twin = envs.load(folder("arrays"))
+    for name in ("X_LOW", "INIT_HIGH", "EVAL_GOAL", "GOAL_INDEX", "ERROR_SCALE", "START"):
+        np.testing.assert_array_equal(getattr(plant, name), getattr(twin, name))
+    arrays = [id(value) for value in vars(twin).values() if isinstance(value, np.ndarray)]
+    assert len(set(arrays)) == len(arrays) >= 15
+    sys.modules["envs.arrays"].X_HIGH[:] = 9
+    assert twin.X_HIGH[0] == twin.INIT_HIGH[0] == 2
+    hidden, rate = (np.int64(8), np.int64(8)), np.array(1e-3)
+    args = training.Args(
+        env="lists", hidden=hidden, learning_rate=rate, total_timesteps=64, out=str(tmp_path)
+    )
+    assert training.load_policy(training.main(args) / "checkpoint.pt").plant is plant
+    mpc = goal_mpc.build_controller(goal_mpc.Args(env="lists", horizon=5, goal=0.6, compile=False))
+    assert np.isfinite(mpc.make_step(plant.START)).all()
+
+
+def test_a_goal_whose_state_always_starts_at_one_value(folder):
+    """A tank that starts empty: the range of goals says what is a large error."""
+    text = SMALLEST + "INIT_LOW, INIT_HIGH, GOAL_LOW, GOAL_HIGH = [0.0, -1.0], [0.0, 1.0], [0.0], [1.0]\n"
+    plant = envs.load(folder("empty", text=text))
+    assert plant.percentage_error(np.array([0.5]), np.array([1.0])) == 100
+    args = goal_mpc.Args(env="empty", objective="quadratic", horizon=15, compile=False)
+    mpc, x = goal_mpc.build_controller(args), plant.START
+    for _ in range(80):
+        x = plant.step(x, mpc.make_step(x))
+    assert mpc.stats["rung"] == "solved" and x[0] == pytest.approx(0.7, abs=0.02)
+
+
+def test_whatever_else_lies_in_the_folder_does_no_harm(folder, tmp_path):
+    (tmp_path / ".#cstr.py").symlink_to("nobody@nowhere:1")
+    (tmp_path / "gone.py").symlink_to("nowhere")
+    (tmp_path / "a_folder.py").mkdir()
+    folder("notes", text='"""How ENV_ID works:\nENV_ID = "RLMPC/CSTR-v0"\n"""\n')
+    assert envs.names() == ["cstr", "double_pendulum", "linear"] and envs.load("cstr").name == "cstr"
+    for number, env_id in enumerate(("My plant", "Tank-v0/", "RLMPC/CSTR", "Tank", "CartPole-v1")):
+        folder(f"odd_{number}", text=f"ENV_ID = {env_id!r}\n")
+        folder(f"odd_{number}", text="raise SystemExit\n")
+    code = f"import envs; envs.__path__.append({str(tmp_path)!r}); import importlib; importlib.reload(envs); print(envs.load('cstr'))"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert out.stdout == "<plant cstr>\n", out.stderr
+
+
 def test_other_files_are_no_plants_and_two_of_one_id_are_refused(folder):
     folder("helper", text="VALUE = 1\n")
     assert "helper" not in envs.names() and "plant" not in envs.names()
@@ -194,6 +288,63 @@ def test_actions_of_another_shape_are_refused():
     for bad in (0.0, [1.0], np.zeros((1, 2)), [np.nan, 0.0]):
         with pytest.raises(ValueError, match="action"):
             env.step(bad)
+
+
+def test_what_numpy_would_broadcast_is_refused():
+    """Three forces for three pendulums of one force each, in a row."""
+    pendulum, linear, cstr_plant = envs.load("double_pendulum"), envs.load("linear", dim=4), envs.load("cstr")
+    three = np.tile(pendulum.START, (3, 1))
+    assert pendulum.step(three, np.array([[-5.0], [0.0], [5.0]]), np.ones((3, 3))).shape == (3, 6)
+    for plant, given in (
+        (pendulum, (three, np.array([-5.0, 0.0, 5.0]), np.ones((3, 3)))),
+        (pendulum, (three, np.zeros((3, 1)), np.ones((3, 1)))),
+        (linear, (linear.START, [1.0])),
+        (cstr_plant, (cstr_plant.START[:1], cstr_plant.U_LOW)),
+    ):
+        with pytest.raises(ValueError, match="has shape"):
+            plant.step(*given)
+    for plant, achieved, goal in ((pendulum, (3, 2), (1,)), (cstr_plant, (3, 1), (3,))):
+        with pytest.raises(ValueError, match="shapes"):
+            envs.GoalEnv(plant.name).compute_reward(np.zeros(achieved), np.zeros(goal))
+        with pytest.raises(ValueError, match="shapes"):
+            envs.time_near_goal(plant, np.zeros(achieved), np.zeros(goal))
+    for scale in ([1.0, 2.0], 0.5, [-1.0, 1.0, 1.0, 1.0]):
+        with pytest.raises(ValueError, match="scale of the mismatch"):
+            envs.load("cstr", observe_mismatch=scale)
+
+
+def test_environments_refuse_what_cannot_be():
+    vec, env = envs.VectorGoalEnv("cstr", 3), envs.GoalEnv("cstr")
+    for made in (vec, env):
+        with pytest.raises(ValueError, match="reset: goal is .* it must lie in"):
+            made.reset(options={"goal": [50.0]})
+    vec.reset(seed=0)
+    with pytest.raises(ValueError, match="reset_mask"):
+        vec.reset(options={"reset_mask": np.array([0, 1, 0])})
+    for wrong in (
+        dict(num_envs=0),
+        dict(branches=-1),
+        dict(max_episode_steps=-1),
+        dict(reward_sigma2=-1.0),
+        dict(reward_tolerance=0.0),
+    ):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            envs.VectorGoalEnv("cstr", **wrong)
+
+
+def test_the_states_that_a_step_reached_are_told_from_those_of_the_next_episode():
+    """By this repository's batch and by gymnasium's own, where plants end at different times."""
+    mode = gym.vector.AutoresetMode.SAME_STEP
+    makers = [partial(gym.make, "RLMPC/CSTR-v0", max_episode_steps=steps) for steps in (2, 3)]
+    theirs = gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
+    for vec in (theirs, envs.VectorGoalEnv("cstr", 2, max_episode_steps=2)):
+        obs, _ = vec.reset(seed=0, options={"psi": cstr.PSI_NOMINAL})
+        for _ in range(7):
+            before = obs["observation"].copy()
+            obs, _, _, _, infos = vec.step(np.tile([20.0, -1000.0], (2, 1)).astype(np.float32))
+            nominal = cstr.step(before, np.tile([20.0, -1000.0], (2, 1)), np.ones((2, 2)))
+            reached = envs.reached_states(obs, infos)
+            assert (np.abs(reached - nominal) < [0.2, 0.2, 5, 5]).all()  # a new episode starts far away
 
 
 def test_the_batch_starts_where_it_is_told_to_as_the_single_environment_does():

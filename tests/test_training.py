@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
 import sac_her_branching as training
@@ -248,6 +250,75 @@ def test_whatever_comes_in_is_saved_as_plain_data(tmp_path):
     assert training.main(training.Args(resume=run / "resume.pt")) == run
 
 
+def test_a_transition_of_another_shape_is_refused(plant):
+    buffer = training.HERBuffer(training.Args(num_envs=3, buffer_size=30), plant)
+    x, u, goal, done = np.zeros((3, 4)), np.zeros((3, 2)), np.zeros((3, 1)), np.zeros(3, dtype=bool)
+    buffer.add(x, u, goal, x, None, done)
+    for wrong in ((x[0], u, goal, x), (x, u[0], goal, x), (x, u, goal[0], x), (x, u, goal, x[:1])):
+        with pytest.raises(ValueError, match="a transition has shape"):
+            buffer.add(*wrong, None, done)
+
+
+def test_a_policy_refuses_states_and_goals_of_another_size():
+    agent = training.SAC(training.Args(env="double_pendulum"), envs.load("double_pendulum"))
+    x, goal = np.zeros((3, 6)), [0.0, 0.0]
+    assert agent.act(x, goal).shape == (3, 1) and agent.value(x[0], goal).shape == (1,)
+    for ask in (agent.act, agent.value, lambda *given: evaluate(agent, given[1], 2, robust=False)):
+        for wrong in ((x, [0.0]), (x, 0.0), (x[:, :5], [0.0])):
+            with pytest.raises(ValueError, match="the agent has"):
+                ask(*wrong)
+
+
+class Untrained(training.SAC):
+    """The same agent whatever the seed of the run, which learns nothing."""
+
+    def __init__(self, args, plant):
+        super().__init__(replace(args, seed=0), plant)
+
+    def update_critic(self, *batch):
+        return {}
+
+    update_actor = update_critic
+
+
+def test_the_evaluation_does_not_depend_on_the_seed_of_the_training(tmp_path):
+    found = []
+    for seed in (0, 1):
+        run = training.main(small(tmp_path, total_timesteps=320, seed=seed), Untrained)
+        row = list(csv.DictReader(open(run / "evaluations.csv")))[-1]
+        found.append({name: value for name, value in row.items() if name != "train_seconds"})
+    assert found[0] == found[1]
+
+
+def test_the_return_that_is_logged_is_the_sum_of_the_rewards_that_are_trained_on(tmp_path):
+    """Of random actions, simulated again by hand; a fifth of it is the price of constraints."""
+    args = small(tmp_path, total_timesteps=200, num_envs=4, learning_starts=200, buffer_size=800)
+    args = replace(args, constraint_weight=3.0)
+    run = training.main(args, Untrained)
+    plant, rng = envs.load("cstr"), np.random.default_rng([args.seed, 2])
+    vec, returns, priced = envs.VectorGoalEnv("cstr", 4), np.zeros(4), np.zeros(4)
+    obs, _ = vec.reset(seed=args.seed)
+    for _ in range(plant.EPISODE_STEPS):
+        obs, reward, _, _, infos = vec.step(rng.uniform(plant.U_LOW, plant.U_HIGH, size=(4, 2)))
+        outside = 3 * envs.outside_constraints(plant, envs.reached_states(obs, infos))
+        returns, priced = returns + reward + outside, priced + outside
+    (logged,) = (
+        event.value for event in EventAccumulator(str(run)).Reload().Scalars("charts/episodic_return")
+    )
+    assert logged == pytest.approx(returns.mean(), rel=1e-5) and priced.mean() < -1
+
+
+def test_a_training_whose_weights_are_lost_ends_with_a_sentence(tmp_path):
+    class Lost(training.SAC):
+        def update_actor(self, *batch):
+            self.actor.head.bias.data[:] = np.nan
+            return {}
+
+    with pytest.raises(ValueError, match="finite") as error:
+        training.main(small(tmp_path, total_timesteps=3200, learning_starts=160), Lost)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 200
+
+
 def test_it_trains_outside_of_the_main_thread(tmp_path):
     with ThreadPoolExecutor(1) as pool:
         run = pool.submit(training.main, small(tmp_path, total_timesteps=320, learning_starts=160)).result()
@@ -318,8 +389,6 @@ def test_command_line_end_to_end(tmp_path):
     u = policy.act(x, [0.6])
     assert u.shape == (5, 2) and ((policy.plant.U_LOW <= u) & (u <= policy.plant.U_HIGH)).all()
     assert policy.value(x, [0.6]).shape == (5,)
-
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run)).Reload()
     assert {

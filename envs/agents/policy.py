@@ -29,7 +29,7 @@ class Scaling:
         others = [j for j in range(len(columns)) if j not in angles]
         values = affine("x", plant.INIT_LOW, plant.INIT_HIGH) | affine("u", plant.U_LOW, plant.U_HIGH)
         values |= affine("goal", plant.INIT_LOW[index], plant.INIT_HIGH[index])
-        values |= {"error_scale": plant.ERROR_SCALE.tolist(), "goal_index": index}
+        values |= {"error_scale": plant.ERROR_SCALE.tolist(), "goal_index": list(index)}
         return cls(**values, angle_index=angles, other_index=others)
 
     def features(self, x, goal, goal_input):
@@ -55,6 +55,11 @@ class Policy:
 
     def features(self, x, goal):
         x, goal = (torch.atleast_2d(torch.as_tensor(v, dtype=torch.float32)) for v in (x, goal))
+        sizes = len(self.scaling.x_center), len(self.scaling.goal_center)
+        if (x.shape[-1], goal.shape[-1]) != sizes:
+            raise ValueError(
+                f"state and goal are {x.shape[-1]} and {goal.shape[-1]} numbers; the agent has {sizes}"
+            )
         return self.scaling.features(x, goal.expand(len(x), -1), self.goal_input)
 
     def physical(self, action):

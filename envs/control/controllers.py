@@ -62,7 +62,7 @@ class Controller:
 
     def reset(self, u=None):
         """Forget everything, as at the start of an episode; u: the action (n_u,) that the plant gets now, default 0."""
-        u = np.zeros(len(self.plant.U_LOW)) if u is None else np.array(u, dtype=float).reshape(-1)
+        u = np.zeros(len(self.plant.U_LOW)) if u is None else np.atleast_1d(np.array(u, dtype=float))
         if u.shape != self.plant.U_LOW.shape or not np.isfinite(u).all():
             raise ValueError(
                 f"u is {u}; it must be {len(self.plant.U_LOW)} finite number(s): {', '.join(self.plant.ACTION_NAMES)}"

@@ -8,6 +8,7 @@ import numpy as np
 import envs
 from envs.control.compiled import OnArrays, compiled_functions
 from envs.control.model import prediction_model, scaling
+from envs.mismatch import checked_scale
 
 # in half-widths of the box of initial states and of the parameters' range, that of the planners' scenarios
 STATE_NOISE = 1e-3  # what the model gets wrong in a step
@@ -32,7 +33,7 @@ class Measured:
 
     def __init__(self, plant, mismatch_scale=None):
         self.plant, self.measured = plant, np.arange(len(plant.X_LOW))
-        self.mismatch_scale = None if mismatch_scale is None else np.array(mismatch_scale)
+        self.mismatch_scale = None if mismatch_scale is None else checked_scale(plant, mismatch_scale)
         self.reset()
 
     def reset(self):
@@ -46,7 +47,12 @@ class Measured:
         return envs.checked_state(self.plant, y)
 
     def update(self, y, u):
-        before, self.x = self.x, self.estimate(np.array(y, dtype=float), u)
+        y, u = self.checked(y), np.array(u, dtype=float)
+        if u.shape != self.plant.U_LOW.shape:
+            raise ValueError(
+                f"u has shape {u.shape}; {self.plant.ENV_ID} has {len(self.plant.U_LOW)} actions"
+            )
+        before, self.x = self.x, self.estimate(y, u)
         if self.mismatch_scale is not None and before is not None and not self.report.get("restarted"):
             with np.errstate(over="ignore", invalid="ignore"):
                 difference = self.x - self.plant.step(before, u, self.plant.PSI_NOMINAL)
@@ -79,7 +85,7 @@ class Filter(Measured):
 
     def __init__(self, plant, measured=None, noise=0.0, *, certain=False, mismatch_scale=None):
         names, noise = list(plant.STATE_NAMES), np.array(noise, dtype=float)
-        chosen = names if measured is None else list(measured)
+        chosen = [measured] if isinstance(measured, str) else list(names if measured is None else measured)
         if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(names):
             text = f"measured is {', '.join(chosen) or 'nothing'}; it must be different ones of {', '.join(names)}"
             raise ValueError(text)
@@ -248,6 +254,8 @@ class ParticleFilter(Filter):
     """
 
     def __init__(self, plant, measured=None, noise=0.0, *, particles=500, seed=0, **options):
+        if particles < 1:
+            raise ValueError(f"particles is {particles}; it must be at least 1")
         self.count, self.seed = particles, seed
         super().__init__(plant, measured, noise, **options)
 

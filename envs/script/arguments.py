@@ -1,25 +1,56 @@
 """Checks of a script's arguments: ValueError, one sentence that names the argument, its value and what is allowed."""
 
 from pathlib import Path
-from typing import Literal, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Literal, Union, get_args, get_origin
 
 import numpy as np
 
 import envs
 
+WORDS = {bool: "True or False", int: "a whole number", float: "a number", str: "text", Path: "a path"}
+
+
+def _converted(value, kind):
+    """A value as the command line gives `kind`. Raises TypeError with what it must be."""
+    if isinstance(value, np.generic) or isinstance(value, np.ndarray) and not value.ndim:
+        value = value.item()
+    if get_origin(kind) is Annotated:  # what the command line takes, and what Python may give instead
+        kind = get_args(kind)[isinstance(value, (tuple, list, np.ndarray))]
+    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    if value is None and type(None) in kinds:
+        return None
+    kind, number = kinds[0], type(value) in (int, float)
+    if get_origin(kind) is Literal:
+        if value not in get_args(kind):
+            raise TypeError(f"choose one of {', '.join(get_args(kind))}")
+        return value
+    if get_origin(kind) is tuple:
+        parts = value.tolist() if isinstance(value, np.ndarray) else value
+        parts = parts if isinstance(parts, (list, tuple)) else [parts]
+        return tuple(_converted(part, get_args(kind)[0]) for part in parts)
+    if kind is int and type(value) is float and value.is_integer() or kind is float and number:
+        return kind(value)
+    if kind is str and number:
+        return repr(value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if not isinstance(value, kind) or kind is int and isinstance(value, bool):
+        raise TypeError(f"it must be {WORDS[kind]}")
+    return value
+
 
 def as_annotated(args):
-    """Put what Python gave into the types of the command line: lists, arrays and single numbers as tuples, text as paths, plain numbers."""
+    """Put what Python gave into the types of the command line: numbers of numpy, lists and arrays, text as paths.
+
+    Raises ValueError for what does not fit.
+    """
     for name, kind in type(args).__annotations__.items():
-        value, kinds = getattr(args, name), get_args(kind) or (kind,)
-        if isinstance(value, np.generic):
-            value = value.item()
-        listed = any(get_origin(each) is tuple for each in (kind, *kinds))
-        if listed and value is not None and not isinstance(value, tuple):
-            value = (value,) if isinstance(value, str) else tuple(np.atleast_1d(value).tolist())
-        if Path in kinds and isinstance(value, str):
-            value = Path(value)
-        object.__setattr__(args, name, value)
+        value = getattr(args, name)
+        try:
+            object.__setattr__(args, name, _converted(value, kind))
+        except TypeError as error:
+            raise ValueError(f"{flag(name)} is {value!r}; {error}") from None
 
 
 def flag(name):
@@ -28,16 +59,11 @@ def flag(name):
 
 
 def check_ranges(args, **ranges):
-    """Numbers of a dataclass of arguments must lie in their (least, most), and what is a choice must be one; None is neither."""
+    """Numbers of a dataclass of arguments must lie in their (least, most); None need not."""
     for name, (least, most) in ranges.items():
         value = getattr(args, name)
         if value is not None and not least <= value <= most:  # nor is nan
             raise ValueError(f"{flag(name)} is {value}; it must lie in [{least:g}, {most:g}]")
-    for name, kind in type(args).__annotations__.items():
-        optional, value = type(None) in get_args(kind), getattr(args, name)
-        literal = get_args(kind)[0] if optional else kind
-        if get_origin(literal) is Literal and value not in (*get_args(literal), *[None] * optional):
-            raise ValueError(f"{flag(name)} is {value!r}; choose one of {', '.join(get_args(literal))}")
 
 
 def check_effects(args, without_effect):

@@ -140,7 +140,7 @@ def loops(cell):
         x, _, row = run_episode(controller, plant, start, plant.PSI_NOMINAL, goal, 150)
         near = envs.goal_reward(plant, x[1:, plant.GOAL_INDEX], goal, sigma2=plant.METRIC_SIGMA2)
         head = {key: getattr(cell, key) for key in ("controller", "horizon", "starts", "equilibrium", "seed")}
-        row = {key: row[f"solve_ms_{key}"] for key in ("median", "p95")}
+        row = {key: row[key] for key in ("solve_ms_median", "solve_ms_p95")}
         row = {"near": near[:100].sum(), "held": near[100:].mean(), "furthest": np.abs(x[:, 0]).max()} | row
         rows.append(head | rounded({"episode": i} | row, 4))
     return rows
@@ -233,7 +233,7 @@ def plot_train(args):
 def measures(rows):
     """Median and 5th percentile of the time near goal, share held, medians of both times of a step."""
     near, held = column(rows, "near"), column(rows, "held") > 0.9
-    times = [np.median(column(rows, key)) for key in ("median", "p95")]
+    times = [np.median(column(rows, key)) for key in ("solve_ms_median", "solve_ms_p95")]
     return [np.median(near), np.quantile(near, 0.05), held.mean(), *times]
 
 

@@ -6,10 +6,8 @@ can start from them; `table` leaves them out.
 
 import copy
 import functools
-import hashlib
 import json
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -48,11 +46,6 @@ class Loop:
     """plants at the edge of the training box times this factor, in place of the evaluation's"""
 
 
-@functools.cache
-def checksum(path):
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
-
-
 def loops(variants, episodes, seed, quick=False):
     """Cells, block by block: `variants` are {label: keywords of deploy.Args and of Loop}. Quick: 2 draws of 3 steps, benchmarks of N = 3,
     not compiled."""
@@ -64,7 +57,7 @@ def loops(variants, episodes, seed, quick=False):
             if quick:
                 options["benchmark"] = (*options.get("benchmark", ()), ("horizon", 3))
             args = deploy.Args(**without(options, *own))
-            key = f"{checksum(deploy.critic_path(args))} {replace(args, critic=None)}"
+            key = f"{common.checksum(deploy.critic_path(args))} {replace(args, critic=None)}"
             kind = {name: options[name] for name in own if name in options}
             found.append(Loop(label, args, key, first, min(first + BLOCK, episodes), **kind))
     return found

@@ -78,7 +78,7 @@ STEPS = {("random", "RL+MPC, N = 5"): 10_000, ("random", "actor"): 10_000}  # of
 CELL = 500  # steps
 COUNTS = "faults refused wrong cost_rose chances recovered planned fell_back held qp_unsolved".split()
 # columns that may differ from run to run
-TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_of_medians|peer_versions)$")
+TIMES = re.compile(r"(^|_)(ms|seconds)(_|$)|^(jobs|machine|ratio_\w+|peer_versions)$")
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def answered(controller):
 
 def closed_loop(cell):
     """One case of one controller: the counts that are a row of the table."""
-    case, name, steps, seed = cell
+    case, name, steps, seed, _ = cell
     controller, lasting = built(name), case in LASTING
     plant, rng = controller.plant, np.random.default_rng([seed, *case.encode(), *name.encode()])
     counts = collections.Counter({key: 0 for key in COUNTS})
@@ -222,10 +222,12 @@ def closed_loop(cell):
 
 def controllers(args):
     rounds = []
-    for name in CONTROLLERS:  # one after the other, so that few processes build and compile the same
+    for name, settings in CONTROLLERS.items():  # in order, so that few processes build and compile the same
+        critic = "" if isinstance(settings, gm.Args) else common.checksum(deploy.critic_path(settings[1]))
         for case in (case for case in FAULTS if name in FAULTS[case]):
             steps = 10 if args.quick else STEPS.get((case, name), CELL)
-            rounds += [(case, name, min(steps, CELL), seed) for seed in range(max(steps // CELL, 1))]
+            parts = range(max(steps // CELL, 1))
+            rounds += [(case, name, min(steps, CELL), seed, critic) for seed in parts]
     total = {}
     for row in common.collect(closed_loop, rounds, args.runs, args.jobs):
         counts = total.setdefault((row["case"], row["controller"]), collections.Counter())
