@@ -224,6 +224,14 @@ def test_arguments_and_names_of_the_code_that_pages_mention_exist():
             assert not missing, (page, missing)
 
 
+def test_the_table_of_labels_has_every_label_that_code_and_pages_name():
+    label = re.compile(r"\b(?:eq|app):\w[\w-]*")
+    texts = [*PAGES.values(), *(path.read_text() for path in SOURCES)]
+    named = {found for text in texts for found in label.findall(text)}
+    table = re.findall(r"^\| `((?:eq|app):[\w-]+)`", PAGES["docs/paper_labels.md"], flags=re.MULTILINE)
+    assert named == set(table) and len(table) > 20
+
+
 def test_citation_names_the_papers_title():
     """In the README and for those who cite."""
     title = "A view on learning robust goal-conditioned value functions: Interplay between RL and MPC"
