@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 import envs
 import rl_mpc_deploy as deploy
 import sac_her_branching as training
+from envs.script.figure import angles_on_one_scale
 from envs.script.pendulum import kinetic_energy, potential_energy, skeleton
 
 dp = envs.load("double_pendulum")
@@ -186,3 +187,14 @@ def test_training_and_deployment_run_on_it(tmp_path):
     rows = deploy.main(args)
     assert [row["controller"] for row in rows] == ["actor", "nominal_mpc", "rl_mpc"]
     assert all(np.isfinite(row["time_near_goal"]) and row["time_outside_constraints"] == 0 for row in rows)
+
+
+def test_angles_are_drawn_without_jumps_and_goals_at_the_turn_that_is_taken():
+    """Up the far side and back down: measured within one turn, drawn to 2 pi and pi; another path ends at the same turn."""
+    up, down = np.linspace(0.9 * np.pi, 2 * np.pi, 30), np.linspace(2 * np.pi, np.pi, 30)
+    path, other = np.concatenate([up, down]), np.linspace(0, -np.pi, 60)
+    goal = np.repeat([0.0, -np.pi], 30)
+    (drawn, second), goals = angles_on_one_scale([np.angle(np.exp(1j * path)), other], goal)
+    np.testing.assert_allclose(drawn - drawn[0], path - path[0], atol=1e-12)
+    np.testing.assert_allclose(goals, drawn[0] - path[0] + np.repeat([2 * np.pi, np.pi], 30))
+    assert second[-1] == pytest.approx(drawn[-1])

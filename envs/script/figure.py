@@ -12,10 +12,21 @@ def new_figure(**options):
     return figure
 
 
-def wrapped(angle):
-    """Angles in [-pi/2, 3 pi/2), so that neither upright (0) nor hanging (pi) is at the edge; jumps are cut by NaN."""
-    angle = (np.asarray(angle) + np.pi / 2) % (2 * np.pi) - np.pi / 2
-    return np.where(np.abs(np.diff(angle, prepend=angle[:1])) > np.pi, np.nan, angle)
+def nearest_turn(angle, to):
+    """The angle plus as many whole turns as bring it nearest to another one."""
+    return angle + 2 * np.pi * np.round((to - angle) / (2 * np.pi))
+
+
+def angles_on_one_scale(paths, goal):
+    """Angles of all paths (steps + 1,) each without jumps, and the goal (steps + 1,) at the turn that the first path takes to reach it.
+
+    All paths end at the same turn.
+    """
+    paths = [np.unwrap(path) for path in paths]
+    paths = [path + nearest_turn(goal[-1], paths[0][-1]) - nearest_turn(goal[-1], path[-1]) for path in paths]
+    changes = np.append(np.flatnonzero(np.diff(goal)), len(goal) - 1)
+    last = changes[np.searchsorted(changes, np.arange(len(goal)))]  # step until which each goal holds
+    return paths, nearest_turn(goal, paths[0][last])
 
 
 def draw_episode(plant, paths, goals, path):
@@ -40,20 +51,23 @@ def draw_episode(plant, paths, goals, path):
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     times = np.arange(len(goals) + 1) * plant.DT
     for ax, i in zip(axes, shown):
-        angle = i in plant.ANGLES
+        drawn = [np.hstack([x, np.vstack([u, u[-1:]])])[:, i] for x, u, _ in paths.values()]
+        goal = goals[:, plant.GOAL_INDEX.index(i)] if i in plant.GOAL_INDEX else np.zeros(len(goals))
+        goal = np.append(goal[:1], goal)
+        if i in plant.ANGLES:
+            drawn, goal = angles_on_one_scale(drawn, goal)
         if i in plant.GOAL_INDEX:
-            goal = goals[:, plant.GOAL_INDEX.index(i)]
-            goal = wrapped(np.append(goal[:1], goal)) if angle else np.append(goal[:1], goal)
             ax.plot(times, goal, color="#CC79A7", lw=2, ls=(0, (1, 1)), drawstyle="steps-pre", label="goal")
-        for label, (x, u, style) in paths.items():
-            values = np.hstack([x, np.vstack([u, u[-1:]])])[:, i]
+        for values, (label, (_, _, style)) in zip(drawn, paths.items()):
             options = {"lw": 1.8, "drawstyle": "default" if i < n_x else "steps-post", "label": label} | style
-            ax.plot(times, wrapped(values) if angle else values, **options)
+            ax.plot(times, values, **options)
         for bound in filter(np.isfinite, (low[i], high[i])):
             ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound")
-        if angle:
-            ax.set_yticks([0, np.pi], ["0 (up)", "π (down)"])
-            ax.set_ylim(-np.pi / 2 - 0.1, 3 * np.pi / 2 + 0.1)
+        if i in plant.ANGLES:
+            low_turn, high_turn = np.round(np.array(ax.get_ylim()) / np.pi).astype(int)
+            turns = np.arange(low_turn, high_turn + 1)
+            multiples = [{0: "0", 1: "π", -1: "-π"}.get(k, f"{k}π") for k in turns]
+            ax.set_yticks(np.pi * turns, [f"{m} ({('up', 'down')[k % 2]})" for m, k in zip(multiples, turns)])
         ax.set_title(titles[i], fontsize=10, loc="left")
         ax.set_xlim(0, times[-1])
     for ax in axes[len(shown) :]:

@@ -41,12 +41,19 @@ POINTS = {  # of cstr_deploy.csv: (colour, marker, name)
 # what the figure shows, with where its name stands in the panel of medians and of 5th percentiles
 DRAWN = {
     "oracle": ((-5, 92.6), (-7.2, 86)),
-    "RL+MPC, N = 5": ((0.25, 83.2), (-7.2, 71)),
+    "RL+MPC, N = 5": ((0.3, 83.2), (-6, 74)),
     "RL+MPC, N = 5, paper's critic": ((-70, 79), (-100, 60)),
     "robust MPC, N = 20": ((0.25, 74.8), (-9, 11)),
     "robust MPC, tuned, N = 40": ((0.25, 77.5), (-9, 48)),
     "RL, constraint-aware": ((0.25, 79.5), (-7.2, 62)),
-    "RL, paper's": ((-80, 89.5), (-100, 71)),
+    "RL, paper's": ((-110, 90.2), (-100, 71)),
+}
+
+
+# where slack weights stand beside their marks: right of them or not, and how far, points
+LABELS_AT = {"RL+MPC, N = 5": (True, 6, 3), "RL+MPC, N = 5, paper's critic": (False, -7, -3)}
+CROWDED = {
+    ("RL+MPC, N = 5, paper's critic", panel, weight) for panel, weight in ((0, "2"), (1, "2"), (1, "0.3"))
 }
 
 
@@ -81,12 +88,11 @@ def plot(args):
             ax.plot(x, y, marker=marker, color=colour, ls=ls, ms=size, lw=1.5)
             name = label.replace(", paper's", ",\npaper's")
             ax.text(*DRAWN[label][k], name, color=colour, fontsize=9, va="center")
+            right, dx, dy = LABELS_AT.get(label, (False, -5, 3))
             for weight, *at in zip(weights, x, y):
-                if weight in (weights[0], "2", weights[-1]):
-                    style = dict(
-                        xytext=(-5, 3), textcoords="offset points", fontsize=7, color=colour, ha="right"
-                    )
-                    ax.annotate(weight, at, **style)
+                if weight in (weights[0], "2", weights[-1]) and (label, k, weight) not in CROWDED:
+                    style = dict(fontsize=7, color=colour, ha="left" if right else "right", va="center")
+                    ax.annotate(weight, at, xytext=(dx, dy), textcoords="offset points", **style)
         for weight, ((near, near_low), (outside, outside_low)) in zip(weights, points):
             text = f"{label}, slack weight {weight}" if weight else label
             print(f"{text:46s}{near:14.1f}{near_low:9.1f}{outside:18.1f}{outside_low:9.1f}")
