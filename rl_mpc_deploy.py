@@ -290,7 +290,7 @@ class ScenarioMPC(Controller):
         self.follow, self.mu = policy or (None, None)
 
     def _functions(self, stage_cost, value, expansion):
-        """CasADi functions of what `_problem` gives, scaled, a column per node but the root.
+        """CasADi functions of what `parameters` gives, scaled, a column per node but the root.
 
         rollout (..., u) -> cost, states; linearise (..., u) -> states, A, B, slopes and Hessians of the costs;
         follow (...) -> the policy's actions; mu (x, goal, mismatch) -> its action, physical units.
@@ -377,7 +377,7 @@ class ScenarioMPC(Controller):
         """What the cost of every node counts, from the weights of the scenarios (S,)."""
         return self.tree.weights(weight) * self.discount ** np.maximum(self.tree.stage - 1, 0)
 
-    def _problem(self, x):
+    def parameters(self, x):
         """Parameters of the compiled functions, a row per column of theirs."""
         starts, psi, weight = self.estimator.belief(self.scenarios)
         u_before = (self.u_before - self.u_center) / self.u_scale
@@ -399,7 +399,7 @@ class ScenarioMPC(Controller):
             found["policy"] = self.follow(*self.problem)[0].copy()
         return found
 
-    def _cost(self, u):
+    def cost(self, u):
         """Cost of a plan; not a number if a state of it is not finite."""
         J, states = self.rollout(*self.problem, u)
         return J.item() if np.isfinite(states).all() else np.nan
@@ -433,7 +433,7 @@ class ScenarioMPC(Controller):
             tolerance, before = self.STATIONARY * abs(cost), cost
             for share in self.SHARES if predicted > tolerance else self.SHARES[:1]:
                 new = np.clip(u + share * step, -1, 1)
-                new_cost = self._cost(new)
+                new_cost = self.cost(new)
                 if new_cost < before and not before - new_cost < 0.1 * share * predicted:
                     u, cost = new, new_cost
                     break
@@ -444,9 +444,9 @@ class ScenarioMPC(Controller):
         return u, cost
 
     def action(self, x, tick):
-        self.problem = self._problem(x)
+        self.problem = self.parameters(x)
         guesses = self.first_guesses(x)
-        costs = {name: cost for name, u in guesses.items() if np.isfinite(cost := self._cost(u))}
+        costs = {name: cost for name, u in guesses.items() if np.isfinite(cost := self.cost(u))}
         if not costs:
             self.plan, self.stats["fell_back"] = None, True
             known = x, self.goals[:, 0], self.estimator.mismatch

@@ -76,8 +76,8 @@ def test_a_plan_teaches_how_its_value_changes_when_it_is_adapted(env, robust_hor
     teacher.STATIONARY, teacher.iterations, checked = 1e-12, 100, 0
 
     def planned_anew(x, plan):
-        teacher.problem = teacher._problem(teacher.estimator.update(x, np.zeros(len(plan[0]))))
-        return -teacher.improve(plan, teacher._cost(plan), 0.0)[1]
+        teacher.problem = teacher.parameters(teacher.estimator.update(x, np.zeros(len(plan[0]))))
+        return -teacher.improve(plan, teacher.cost(plan), 0.0)[1]
 
     for x in states:
         teacher.reset()
@@ -144,8 +144,8 @@ def test_a_mirrored_plant_teaches_twice(pendulum):
         found = []
         for sign in (1, -1):
             teacher.reset()
-            teacher.problem = teacher._problem(teacher.estimator.update(sign * x, np.zeros(1)))
-            found.append(teacher._cost(sign * u))
+            teacher.problem = teacher.parameters(teacher.estimator.update(sign * x, np.zeros(1)))
+            found.append(teacher.cost(sign * u))
         assert found[0] == pytest.approx(found[1], rel=1e-12)
 
 
