@@ -54,6 +54,8 @@ SHAPES |= {"n_goal": "EVAL_GOAL GOAL_LOW GOAL_HIGH ERROR_SCALE", "*n_goal": "TRA
 SHAPES = {name: shape for shape, names in SHAPES.items() for name in names.split()}
 POSITIVE = "DT ERROR_SCALE REWARD_SIGMA2 REWARD_TOLERANCE MPC_SIGMA2 METRIC_SIGMA2 MISMATCH_SCALE".split()
 WHOLE = "EPISODE_STEPS", "MODEL_SUBSTEPS"
+KEYS = {"BENCHMARK": "horizon slack_price change_weight", "TRAINING": "hidden total_timesteps num_envs gamma"}
+KEYS["TRAINING"] += " steps_per_update learning_starts buffer_size alpha_init"
 MAY_BE_INFINITE = "X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH"
 
 
@@ -288,9 +290,12 @@ def _check(p, name):
         for each in filter(lambda each: hasattr(p, each), names):
             if not ((low <= getattr(p, each)) & (getattr(p, each) <= high)).all():
                 refuse(f"{each} is not within {box}_LOW {low.tolist()} and {box}_HIGH {high.tolist()}")
-    unknown = set(getattr(p, "BENCHMARK", {})) - {"horizon", "slack_price", "change_weight"}
-    if unknown:
-        refuse(f"BENCHMARK has {', '.join(sorted(unknown))}; it takes horizon, slack_price and change_weight")
+
+    # settings
+    for each, known in KEYS.items():
+        unknown = set(getattr(p, each, {})) - set(known.split())
+        if unknown:
+            refuse(f"{each} has {', '.join(sorted(unknown))}; it takes {known.replace(' ', ', ')}")
     for each in ("nominal", "mpc", "robust"):
         if each not in getattr(p, "SCENARIOS", [each]):
             refuse(f"SCENARIOS lacks {each!r}")

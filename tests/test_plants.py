@@ -140,6 +140,7 @@ ADDED = {
     "X_LOW = 'low'": "X_LOW is 'low'",
     "SCENARIOS = [1.0]": "SCENARIOS is",
     "def step(x, u, psi):\n    return x[:1]": "step at START gives",
+    "TRAINING = dict(gama=0.9)": "TRAINING has gama; it takes hidden, .*gamma",
     "raise SystemExit": "cannot be imported .SystemExit",
     "ENV_ID = 'A plant'": "ENV_ID is 'A plant'; it must be as 'Word/Word-v0'",
     "ENV_ID = 'RLMPC/' + 'Tank-v0'": "ENV_ID is 'RLMPC/'; it must be as",
@@ -157,6 +158,14 @@ def test_a_name_that_is_wrong_is_refused_by_name(folder, number):
         envs.load(folder(f"added_{number}", text=f"{text}\n{line}\n"))
     assert "\n" not in str(error.value) and f"envs/added_{number}.py" in str(error.value)
     assert envs.load("cstr").name == "cstr"
+
+
+def test_a_plant_may_set_what_training_takes_from_it(folder):
+    import sac_her_branching as training
+
+    for name, value in training.DEFAULTS.items():
+        plant = folder(f"sets_{name}", text=f"{SMALLEST}\nTRAINING = dict({name}={value})\n")
+        assert getattr(training.Args(env=plant), name) == value
 
 
 def test_lists_and_numpys_numbers_make_the_same_plant(folder, tmp_path):
