@@ -42,9 +42,10 @@ It may name, in place of the default in brackets:
     GOALS, expert_cost, EXPERT_CHANGE_WEIGHT, animate    for goal_mpc.py: goals by name, another objective, a film
 
 A family of plants (`envs/linear.py`) defines `make(dim, system)`, which returns an object with these names; one with a
-linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline. `plant.py` holds defaults, checks and
-measures, `goal_env.py` the environments, `mismatch.py` what agents may observe of transitions; `control/`, `agents/` and `script/` are
-what the scripts share beside plants.
+linear-quadratic regulator has lqr, lq_cost, lq_value, feedback and baseline.
+
+`plant.py` holds defaults and checks, `measures.py` what scripts ask of a plant, `goal_env.py` the environments, `mismatch.py`
+what agents may observe of transitions; `control/`, `agents/` and `script/` are what the scripts share beside plants.
 """
 
 import ast
@@ -58,25 +59,21 @@ from pathlib import Path
 import gymnasium as gym
 
 from envs.goal_env import GoalEnv, VectorGoalEnv, reached_states  # noqa: F401
-from envs.mismatch import Mismatch  # noqa: F401
-from envs.plant import (  # noqa: F401
-    Plant,
+from envs.measures import (  # noqa: F401
     can_hold,
     checked_goal,
     checked_state,
     goal_reward,
-    grid,
     half_width,
     outside_constraints,
     reachable_goals,
-    rk4,
     sample_states,
     scenario_set,
-    stack,
     state_range,
-    stepper,
     time_near_goal,
 )
+from envs.mismatch import Mismatch  # noqa: F401
+from envs.plant import Plant, grid, rk4, stack, stepper  # noqa: F401
 
 
 def _env_id(path):

@@ -5,8 +5,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from envs.measures import goal_reward, sample_states
 from envs.mismatch import Mismatch
-from envs.plant import goal_reward, sample_states
 
 
 class _PlantSpaces:

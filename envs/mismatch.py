@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from envs.plant import sample_states
+from envs.measures import sample_states
 
 
 def checked_scale(plant, scale):
