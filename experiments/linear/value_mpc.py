@@ -37,7 +37,7 @@ from experiments.common import column, distinct, rounded, select, without
 from experiments.palette import BLUE, GREEN, GREY, ORANGE, PINK, RED
 
 ACTOR, REGULATOR = "RL (actor alone)", "goal-conditioned MPC, regulator's value"
-NO_VALUE, TAYLOR = "goal-conditioned MPC, no value", "RL+MPC, taylor"
+NO_VALUE, TAYLOR = "goal-conditioned MPC, no value", "RL+MPC, V expanded about the goal"
 RL_MPC, ONE = dict(controllers=("rl_mpc",)), dict(controllers=("rl_mpc",), iterations=1)
 CONTROLLERS = {  # label: (colour, dashes, settings of rl_mpc_deploy.py, or None for goal_mpc.py)
     ACTOR: (RED, "--", dict(controllers=("actor",))),
