@@ -328,8 +328,9 @@ def costs(plant, objective, sigma2=None):
         return -ca.exp(-cost / (2 * sigma2)) if objective == "goal" else cost
 
     defined = "quadratic", "goal", *(["expert"] if hasattr(plant, "expert_cost") else [])
-    if objective not in defined or not sigma2 > 0:
-        raise ValueError(f"--objective {objective}, sigma^2 {sigma2}: not defined for {plant.ENV_ID}")
+    if objective not in defined or objective == "goal" and not sigma2 > 0:
+        what = f"--objective {objective}" if objective not in defined else f"--sigma2 {sigma2}"
+        raise ValueError(f"{what} is not defined for {plant.ENV_ID}; choose {', '.join(defined)}, sigma2 > 0")
     if objective == "expert":
         return ca.Function("stage", [x, goal], [plant.expert_cost(x, ca)], once), None
     if linear:

@@ -26,7 +26,6 @@ import math
 import sys
 import time
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -220,7 +219,7 @@ class HERBuffer:
     def __init__(self, args, plant):
         self.rows, self.num_envs = args.buffer_size // args.num_envs, args.num_envs
         self.branches = args.branches if args.branches > 1 else 0  # one is the transition's own next state
-        self.strategy, self.ratio, self.goal_index = args.her_strategy, args.her_ratio, list(plant.GOAL_INDEX)
+        self.strategy, self.ratio, self.goal_index = args.her_strategy, args.her_ratio, plant.GOAL_INDEX
         n_x, n_u, shape = len(plant.X_LOW), len(plant.U_LOW), (self.rows, self.num_envs)
         self.x, self.x_next = torch.zeros(2, *shape, n_x)
         self.u = torch.zeros(*shape, n_u)
@@ -232,10 +231,11 @@ class HERBuffer:
     def add(self, x, u, goal, x_next, branch_next, done):
         """One transition of each plant, (num_envs, ...); branch_next (num_envs, K, n_x) or None; done (num_envs,)."""
         row = self.now % self.rows
-        stored = [(self.x, x), (self.u, u), (self.goal, goal), (self.x_next, x_next)]
-        for store, value in stored + ([(self.branch_next, branch_next)] if self.branches else []):
+        branches = {"branch_next": branch_next} if self.branches else {}
+        for name, value in dict(x=x, u=u, goal=goal, x_next=x_next, **branches).items():
+            store = getattr(self, name)
             if np.shape(value) != store.shape[1:]:
-                raise ValueError(f"a transition has shape {np.shape(value)}, not {tuple(store.shape[1:])}")
+                raise ValueError(f"{name} has shape {np.shape(value)}, not {tuple(store.shape[1:])}")
             store[row] = torch.as_tensor(value, dtype=torch.float32)
         self.end[row] = self.OPEN
         if done.any():
@@ -287,8 +287,8 @@ class SAC(Policy):
         self.generator = torch.Generator().manual_seed(args.seed)
 
         trained = {"actor": actor.parameters(), "critic": critic.parameters(), "alpha": [self.log_alpha]}
-        adam = partial(torch.optim.Adam, lr=args.learning_rate, fused=True)
-        self.optimisers = {name: adam(parameters) for name, parameters in trained.items()}
+        adam = dict(lr=args.learning_rate, fused=True)
+        self.optimisers = {name: torch.optim.Adam(parts, **adam) for name, parts in trained.items()}
         self.saved = {f"{name} optimiser": optimiser for name, optimiser in self.optimisers.items()}
         self.saved |= {"actor": actor, "critic": critic, "target": self.target}
 

@@ -25,7 +25,8 @@ It may name, in place of the default in brackets:
     GOAL_LOW, GOAL_HIGH         range of goals (the box of initial states)
     GOAL_REACHABLE              box of those that every scenario can hold, see `reachable_goals` (GOAL_LOW, GOAL_HIGH);
       or held_action(goal)      the action that holds a goal, infinite if none does
-    ERROR_SCALE                 a large goal error, (n_goal,), for the networks (a fortieth of the box's width)
+    ERROR_SCALE                 a large goal error, (n_goal,), for the networks (a fortieth of the width of the box of
+                                initial states, or where that has none of the range of goals)
     REWARD_SIGMA2               sigma^2 of the Gaussian reward ((ERROR_SCALE / 5)^2)
     REWARD_TOLERANCE            half-width of the sparse reward (ERROR_SCALE / 5)
     MPC_SIGMA2, METRIC_SIGMA2   sigma^2 of the planners' stage cost and of the measures ((2 ERROR_SCALE)^2)
@@ -57,6 +58,7 @@ from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 
 from envs.goal_env import GoalEnv, VectorGoalEnv, reached_states  # noqa: F401
 from envs.measures import (  # noqa: F401
@@ -80,6 +82,8 @@ def _env_id(path):
     """The text that a module assigns to ENV_ID; None if it does not, or is no file. One that is half written is a plant, too."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
+        if "ENV_ID" not in text:
+            return None
         assigned = [
             node for node in ast.walk(ast.parse(text)) if isinstance(node, (ast.Assign, ast.AnnAssign))
         ]
@@ -111,9 +115,9 @@ def load(name, observe_mismatch=False, **options):
     there (with the list of what is), cannot be imported, lacks a name or shares its ENV_ID, and for an option that it does not take.
     """
     plant = _load(name, tuple(sorted((k, v) for k, v in options.items() if v is not None)))
-    return (
-        Mismatch(plant, None if observe_mismatch is True else observe_mismatch) if observe_mismatch else plant
-    )
+    if isinstance(observe_mismatch, (bool, np.bool_)):
+        return Mismatch(plant) if observe_mismatch else plant
+    return Mismatch(plant, observe_mismatch)
 
 
 @cache
@@ -126,10 +130,8 @@ def _load(name, options):
         raise ValueError(
             f"--env {name}: {' and '.join(f'envs/{other}.py' for other in same)} have the same ENV_ID; give one another"
         )
-    if not _registered(name, ids[name]):
-        raise ValueError(
-            f"envs/{name}.py: ENV_ID is {ids[name]!r}; it must be as 'Word/Word-v0', and no other environment's"
-        )
+    if not _register(name, ids[name]):
+        raise ValueError(f"envs/{name}.py: ENV_ID is {ids[name]!r}, {_trouble(ids[name])}")
     try:
         module = importlib.import_module(f"{__name__}.{name}")
     except (Exception, SystemExit) as error:  # whatever a half-written plant raises
@@ -141,8 +143,8 @@ def _load(name, options):
     return Plant(module.make(**dict(options)) if hasattr(module, "make") else module, name, options)
 
 
-def _registered(name, env_id):
-    """Whether gymnasium knows the plant: it is told, but may refuse the id, or have it already."""
+def _register(name, env_id):
+    """Tell gymnasium of a plant; returns whether it knows it: it may refuse the id, or have it already."""
     if env_id not in gym.registry:
         with contextlib.suppress(gym.error.Error):
             made_by = dict(entry_point="envs:GoalEnv", vector_entry_point="envs:VectorGoalEnv")
@@ -150,5 +152,13 @@ def _registered(name, env_id):
     return env_id in gym.registry and gym.registry[env_id].kwargs.get("plant") == name
 
 
+def _trouble(env_id):
+    """Why gymnasium does not take an id."""
+    if env_id not in gym.registry:
+        return "which gymnasium refuses; it must be one text such as 'Word/Word-v0'"
+    owner = gym.registry[env_id].kwargs.get("plant")
+    return f"which is already that of {f'envs/{owner}.py' if owner else 'another environment'}"
+
+
 for _name, _id in _ids().items():
-    _registered(_name, _id)
+    _register(_name, _id)

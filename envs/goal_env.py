@@ -67,8 +67,11 @@ class _PlantSpaces:
             )
         return np.clip(action, self.plant.U_LOW, self.plant.U_HIGH)
 
-    def _options(self, options, shape):
-        """Copies of the state, goal and parameters that `reset` is given, each (*shape, n) or (n,); what is not given is left out."""
+    def _options(self, options, shape, used=()):
+        """Copies of the state, goal and parameters that `reset` is given, each (*shape, n) or (n,); what is not given is left out.
+
+        used: which rows count.
+        """
         n_x = len(self.plant.MISMATCH_SCALE) if isinstance(self.plant, Mismatch) else len(self.plant.X_LOW)
         sizes = {"state": n_x, "goal": len(self.plant.GOAL_INDEX), "psi": len(self.plant.PSI_NOMINAL)}
         found = {}
@@ -81,15 +84,15 @@ class _PlantSpaces:
                     raise ValueError(
                         f"reset: {name} is {value.tolist()}; it must be finite, of shape {(*shape, n)}"
                     )
-                if (
-                    name == "goal"
-                    and not ((self.plant.GOAL_LOW <= value) & (value <= self.plant.GOAL_HIGH)).all()
-                ):
-                    box = f"{self.plant.GOAL_LOW.tolist()} to {self.plant.GOAL_HIGH.tolist()}"
-                    raise ValueError(f"reset: goal is {value.tolist()}; it must lie in {box}")
                 if name == "state" and isinstance(self.plant, Mismatch):  # none yet
                     value = np.concatenate([value, np.zeros_like(value)], axis=-1)
                 found[name] = np.broadcast_to(value, (*shape, value.shape[-1])).copy()
+        if "goal" in found:
+            goal, low, high = found["goal"][used], self.plant.GOAL_LOW, self.plant.GOAL_HIGH
+            if not ((low <= goal) & (goal <= high)).all():
+                raise ValueError(
+                    f"reset: goal is {goal.tolist()}; it must lie in {low.tolist()} to {high.tolist()}"
+                )
         return found
 
 
@@ -191,10 +194,10 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
-        if mask is not None and (np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != bool):
-            raise ValueError(
-                f"reset: reset_mask is {mask}; it must be True or False for each of {self.num_envs}"
-            )
+        mask = None if mask is None else np.asarray(mask)
+        if mask is not None and (mask.shape != (self.num_envs,) or mask.dtype != bool):
+            text = f"it must be True or False for each of {self.num_envs}"
+            raise ValueError(f"reset: reset_mask is {mask}; {text}")
         if mask is None:
             self.x = np.empty((self.num_envs, len(self.plant.X_LOW)))
             self.goal = np.empty((self.num_envs, len(self.plant.GOAL_INDEX)))
@@ -203,7 +206,7 @@ class VectorGoalEnv(_PlantSpaces, gym.vector.VectorEnv):
             self.held = np.zeros(self.num_envs, dtype=bool)  # whose psi lasts for the episode
             mask = np.ones(self.num_envs, dtype=bool)
         self._reset_rows(mask)
-        for name, value in self._options(options, (self.num_envs,)).items():
+        for name, value in self._options(options, (self.num_envs,), mask).items():
             kept = {"state": self.x, "goal": self.goal, "psi": self.psi}[name]
             kept[mask] = value[mask]
             self.held |= mask & (name == "psi")

@@ -25,7 +25,7 @@ class Mismatch:
     """
 
     def __init__(self, plant, scale=None):
-        if not hasattr(plant, "MISMATCH_SCALE"):
+        if scale is None and not hasattr(plant, "MISMATCH_SCALE"):
             raise ValueError(f"--observe-mismatch: {plant.ENV_ID} has no MISMATCH_SCALE")
         self.plant, n = plant, len(plant.X_LOW)
         self.MISMATCH_SCALE = checked_scale(plant, plant.MISMATCH_SCALE if scale is None else scale)
@@ -50,7 +50,8 @@ class Mismatch:
         x = sample_states(self.plant, rng, n)
         return np.hstack([x, np.zeros_like(x)])
 
-    def step(self, x, u, psi):
+    def step(self, x, u, psi=None):
+        psi = self.plant.PSI_NOMINAL if psi is None else psi
         x = np.asarray(x)[..., : len(self.plant.X_LOW)]
         x_next = self.plant.step(x, u, psi)
         nominal = self.plant.step(x, u, np.broadcast_to(self.plant.PSI_NOMINAL, np.shape(psi)))

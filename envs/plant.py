@@ -1,5 +1,6 @@
 """What a plant is: the names that a module of this folder has, their defaults and checks, and Runge-Kutta steps."""
 
+import copy
 import itertools
 
 import numpy as np
@@ -54,8 +55,13 @@ SHAPES |= {"n_goal": "EVAL_GOAL GOAL_LOW GOAL_HIGH ERROR_SCALE", "*n_goal": "TRA
 SHAPES = {name: shape for shape, names in SHAPES.items() for name in names.split()}
 POSITIVE = "DT ERROR_SCALE REWARD_SIGMA2 REWARD_TOLERANCE MPC_SIGMA2 METRIC_SIGMA2 MISMATCH_SCALE".split()
 WHOLE = "EPISODE_STEPS", "MODEL_SUBSTEPS"
-KEYS = {"BENCHMARK": "horizon slack_price change_weight", "TRAINING": "hidden total_timesteps num_envs gamma"}
-KEYS["TRAINING"] += " steps_per_update learning_starts buffer_size alpha_init"
+KEYS = {
+    "BENCHMARK": ("horizon", "slack_price", "change_weight"),
+    "TRAINING": (
+        *("hidden", "total_timesteps", "num_envs", "gamma"),
+        *("steps_per_update", "learning_starts", "buffer_size", "alpha_init"),
+    ),
+}
 MAY_BE_INFINITE = "X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH"
 
 
@@ -72,11 +78,11 @@ class Plant:
         missing += [] if hasattr(source, "ode") or hasattr(source, "next_state") else ["ode"]
         if missing:
             raise ValueError(f"envs/{name}.py lacks {', '.join(missing)}")
-        vars(self).update(_given(source, name))
+        vars(self).update(_copies(source, name))
         _check(self, name)
         defaults = _defaults(self)
-        self.simulated = getattr(source, "step", None) or defaults.pop("step")
-        benchmark = defaults["BENCHMARK"] | getattr(source, "BENCHMARK", {})  # may name some of it
+        self.own_step = getattr(source, "step", defaults["step"])
+        benchmark = defaults["BENCHMARK"] | getattr(self, "BENCHMARK", {})  # may name some of it
         vars(self).update({k: v for k, v in defaults.items() if not hasattr(self, k)}, BENCHMARK=benchmark)
         _check(self, name)
         _try_a_step(self)
@@ -91,7 +97,7 @@ class Plant:
         for name, value, like in (("x", x, self.X_LOW), ("u", u, self.U_LOW), ("psi", psi, self.PSI_NOMINAL)):
             if np.shape(value)[-1:] != like.shape:
                 raise ValueError(f"{name} has shape {np.shape(value)}; {self.ENV_ID} has {len(like)}")
-        return self.simulated(x, u, psi, *more, **options)
+        return self.own_step(x, u, psi, *more, **options)
 
     def __getattr__(self, name):
         if name == "source" or name.startswith("__"):  # not yet there, while it is copied
@@ -126,9 +132,10 @@ COPIES |= dict.fromkeys(("GOAL_INDEX", "ANGLES"), lambda value: np.atleast_1d(va
 COPIES |= dict.fromkeys(("STATE_NAMES", "STATE_UNITS", "ACTION_NAMES", "ACTION_UNITS"), _texts)
 COPIES |= dict.fromkeys(("MEASURED", "PSI_NAMES"), _texts)
 COPIES |= dict.fromkeys(("SCENARIOS", "GOALS"), lambda sets: {k: _floats(v) for k, v in sets.items()})
+COPIES |= {"GOAL_REACHABLE": _floats} | dict.fromkeys(KEYS, copy.deepcopy)
 
 
-def _given(source, name):
+def _copies(source, name):
     """Copies of the constants that a plant's source has, in the types that everything else relies on."""
     found = {}
     for each in filter(lambda each: hasattr(source, each), COPIES):
@@ -248,7 +255,7 @@ def _check(p, name):
         refuse(f"MEASURED is {p.MEASURED}; it must be names of states")
     for each in ("GOAL_INDEX", "ANGLES"):
         found = getattr(p, each, [])
-        whole = isinstance(found, list) and all(type(i) is int and 0 <= i < n_x for i in found)
+        whole = all(type(i) is int and 0 <= i < n_x for i in found)
         if not whole or len(set(found)) < len(found):
             refuse(f"{each} is {found}; it must be different indices of the {n_x} states")
 
@@ -257,7 +264,9 @@ def _check(p, name):
     arrays |= {f"SCENARIOS[{k!r}]": (value, "*n_psi") for k, value in getattr(p, "SCENARIOS", {}).items()}
     arrays |= {f"GOALS[{k!r}]": (value, "n_goal") for k, value in getattr(p, "GOALS", {}).items()}
     if hasattr(p, "GOAL_REACHABLE"):
-        arrays |= {f"GOAL_REACHABLE[{k}]": (p.GOAL_REACHABLE[k], "n_goal") for k in (0, 1)}
+        ends = np.asarray(p.GOAL_REACHABLE)
+        if ends.shape != (2, n_goal) or not (ends[0] <= ends[1]).all():  # nor is nan
+            refuse(f"GOAL_REACHABLE is {ends.tolist()}; it must be {n_goal} lowest and as many highest goals")
     for each, (value, shape) in arrays.items():
         value, n, rows = np.asarray(value, dtype=float), sizes[shape.strip("*")], shape[0] == "*"
         if value.ndim != 1 + rows or value.shape[-1] != n or not len(value) and rows:
@@ -269,8 +278,11 @@ def _check(p, name):
     # numbers
     for each in POSITIVE:
         value = np.asarray(getattr(p, each, 1.0))
-        if value.dtype.kind not in "if" or not (value > 0).all():
-            refuse(f"{each} is {value.tolist()!r}; it must be positive")
+        if value.ndim and each not in SHAPES or value.dtype.kind not in "iuf":
+            refuse(f"{each} is {value.tolist()!r}; it must be a positive number")
+        if not ((value > 0) & (value < np.inf)).all():
+            hint = "; give it, or GOAL_LOW and GOAL_HIGH" if each == "ERROR_SCALE" else ""
+            refuse(f"{each} is {value.tolist()}; it must be positive and finite{hint}")
     for each in WHOLE:
         value = getattr(p, each, 1)
         if not isinstance(value, (int, np.integer)) or value < 1:
@@ -289,13 +301,18 @@ def _check(p, name):
             refuse(f"{box}_LOW is {low.tolist()}, {box}_HIGH {high.tolist()}; they are not in order")
         for each in filter(lambda each: hasattr(p, each), names):
             if not ((low <= getattr(p, each)) & (getattr(p, each) <= high)).all():
-                refuse(f"{each} is not within {box}_LOW {low.tolist()} and {box}_HIGH {high.tolist()}")
+                found = getattr(p, each).tolist()
+                refuse(
+                    f"{each} {found} is not within {box}_LOW {low.tolist()} and {box}_HIGH {high.tolist()}"
+                )
 
     # settings
     for each, known in KEYS.items():
-        unknown = set(getattr(p, each, {})) - set(known.split())
+        if not isinstance(getattr(p, each, {}), dict):
+            refuse(f"{each} is {getattr(p, each)!r}; it must be a dict of {', '.join(known)}")
+        unknown = set(getattr(p, each, {})) - set(known)
         if unknown:
-            refuse(f"{each} has {', '.join(sorted(unknown))}; it takes {known.replace(' ', ', ')}")
+            refuse(f"{each} has {', '.join(sorted(unknown))}; it takes {', '.join(known)}")
     for each in ("nominal", "mpc", "robust"):
         if each not in getattr(p, "SCENARIOS", [each]):
             refuse(f"SCENARIOS lacks {each!r}")

@@ -198,3 +198,6 @@ def test_angles_are_drawn_without_jumps_and_goals_at_the_turn_that_is_taken():
     np.testing.assert_allclose(drawn - drawn[0], path - path[0], atol=1e-12)
     np.testing.assert_allclose(goals, drawn[0] - path[0] + np.repeat([2 * np.pi, np.pi], 30))
     assert second[-1] == pytest.approx(drawn[-1])
+    (drawn,), goals = angles_on_one_scale([np.array([0.0, 0.1, np.nan, 0.3])], np.zeros(4))
+    np.testing.assert_array_equal(np.isnan(drawn), [False, False, True, False])
+    assert not goals.any()

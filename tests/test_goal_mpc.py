@@ -260,7 +260,7 @@ def test_hard_bounds_hold_in_a_tree_from_the_first_prediction_on():
 def test_an_objective_that_is_none_is_refused():
     """Once a capital letter gave the quadratic one."""
     for wrong in (("Goal",), ("goal", 0.0), ("goal", -1.0), ("goal", np.nan)):
-        with pytest.raises(ValueError, match="not defined for RLMPC/CSTR-v0"):
+        with pytest.raises(ValueError, match="is not defined for RLMPC/CSTR-v0; choose quadratic, goal"):
             gm.costs(envs.load("cstr"), *wrong)
 
 

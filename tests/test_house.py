@@ -19,6 +19,8 @@ from envs.agents.evaluation import evaluation_row
 from envs.control.compiled import compiled
 from envs.script.comparison import write_csv
 from envs.script.figure import draw_episode
+from experiments import common
+from experiments.reactor import tune
 
 ROOT = Path(__file__).parent.parent
 LINES = {"sac_her_branching.py": 520, "goal_mpc.py": 480, "rl_mpc_deploy.py": 640}
@@ -91,6 +93,10 @@ def test_arguments_from_python_are_those_of_the_command_line():
     ):
         with pytest.raises(ValueError, match="it must be"):
             training.Args(**wrong)
+    assert deploy.Args(goal=torch.tensor([0.5])).goal == (0.5,)
+    study = tune.Args(out="x", runs="y", jobs=2.0)  # inherited fields, too
+    common.as_annotated(study)
+    assert (study.out, study.runs, study.jobs) == (Path("x"), Path("y"), 2)
     assert hash(args) and deploy.Args(goal=0.6).goal == (0.6,)
     assert goal_mpc.Args(goal="0.7", out="x") == goal_mpc.Args(goal=("0.7",), out=Path("x"))
     assert training.Args(hidden=[32, 16], out="x").hidden == (32, 16)

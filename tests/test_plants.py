@@ -3,6 +3,7 @@
 import copy
 import importlib
 import pickle
+import shutil
 import subprocess
 import sys
 from functools import partial
@@ -15,6 +16,7 @@ import pytest
 import envs
 import goal_mpc
 from envs import cstr
+from envs.plant import KEYS
 
 ROOT = Path(__file__).parent.parent
 SMALLEST = """
@@ -126,25 +128,31 @@ ADDED = {
     "ERROR_SCALE = [-1.0]": "ERROR_SCALE is .-1.0.; it must be positive",
     "MISMATCH_SCALE = [0.1]": "MISMATCH_SCALE has shape",
     "METRIC_SIGMA2 = 0": "METRIC_SIGMA2 is 0; it must be positive",
-    "MPC_SIGMA2 = 'wide'": "MPC_SIGMA2 is 'wide'; it must be positive",
+    "MPC_SIGMA2 = 'wide'": "MPC_SIGMA2 is 'wide'; it must be a positive number",
     "EPISODE_STEPS = 0": "EPISODE_STEPS is 0; it must be a whole number",
     "MODEL_SUBSTEPS = 1.5": "MODEL_SUBSTEPS is 1.5; it must be a whole number",
     "GOAL_INDEX = [0.0]": "GOAL_INDEX is .0.0.; it must be different indices",
     "MEASURED = 'x'": "MEASURED is",
     "STATE_NAMES = 'p', 'p'": "STATE_NAMES is .*each may be there once",
     "GOALS = {'far': [0.1, 0.2]}": "GOALS.'far'. has shape",
-    "GOAL_LOW, GOAL_HIGH = [0.0], [0.6]": "EVAL_GOAL is not within GOAL_LOW",
+    "GOAL_LOW, GOAL_HIGH = [0.0], [0.6]": "EVAL_GOAL .0.7. is not within GOAL_LOW",
     "GOAL_LOW = [0.0]": "GOAL_LOW and GOAL_HIGH belong together",
-    "OBS_LOW, OBS_HIGH = [-1, -1], [1, 1]": "INIT_LOW is not within OBS_LOW",
-    "PSI_NOMINAL, PSI_LOW, PSI_HIGH = [2.0], [0.0], [1.0]": "PSI_NOMINAL is not within PSI_LOW",
+    "OBS_LOW, OBS_HIGH = [-1, -1], [1, 1]": "INIT_LOW .* is not within OBS_LOW",
+    "PSI_NOMINAL, PSI_LOW, PSI_HIGH = [2.0], [0.0], [1.0]": "PSI_NOMINAL .* is not within PSI_LOW",
     "X_LOW = 'low'": "X_LOW is 'low'",
     "SCENARIOS = [1.0]": "SCENARIOS is",
     "def step(x, u, psi):\n    return x[:1]": "step at START gives",
     "TRAINING = dict(gama=0.9)": "TRAINING has gama; it takes hidden, .*gamma",
     "raise SystemExit": "cannot be imported .SystemExit",
-    "ENV_ID = 'A plant'": "ENV_ID is 'A plant'; it must be as 'Word/Word-v0'",
-    "ENV_ID = 'RLMPC/' + 'Tank-v0'": "ENV_ID is 'RLMPC/'; it must be as",
-    "ENV_ID = 'CartPole-v1'": "ENV_ID is 'CartPole-v1'; .* no other environment's",
+    "ENV_ID = 'A plant'": "ENV_ID is 'A plant', which gymnasium refuses; it must be one text such as 'Word/Word-v0'",
+    "ENV_ID = 'RLMPC/' + 'Tank-v0'": "ENV_ID is 'RLMPC/', which gymnasium refuses",
+    "ENV_ID = 'CartPole-v1'": "ENV_ID is 'CartPole-v1', which is already that of another environment",
+    "DT = [0.1, 0.2]": "DT is .0.1, 0.2.; it must be a positive number",
+    "REWARD_SIGMA2 = [1.0, 2.0]": "REWARD_SIGMA2 is .* it must be a positive number",
+    "METRIC_SIGMA2 = np.inf": "METRIC_SIGMA2 is inf; it must be positive and finite",
+    "GOAL_REACHABLE = [[0.1]]": "GOAL_REACHABLE is ..0.1..; it must be 1 lowest",
+    "GOAL_REACHABLE = [0.9], [0.1]": "GOAL_REACHABLE is ..0.9., .0.1..; it must be",
+    "BENCHMARK = None": "BENCHMARK is None; it must be a dict",
 }
 
 
@@ -163,6 +171,7 @@ def test_a_name_that_is_wrong_is_refused_by_name(folder, number):
 def test_a_plant_may_set_what_training_takes_from_it(folder):
     import sac_her_branching as training
 
+    assert set(KEYS["TRAINING"]) == set(training.DEFAULTS)
     for name, value in training.DEFAULTS.items():
         plant = folder(f"sets_{name}", text=f"{SMALLEST}\nTRAINING = dict({name}={value})\n")
         assert getattr(training.Args(env=plant), name) == value
@@ -213,12 +222,14 @@ def test_whatever_else_lies_in_the_folder_does_no_harm(folder, tmp_path):
     (tmp_path / "a_folder.py").mkdir()
     folder("notes", text='"""How ENV_ID works:\nENV_ID = "RLMPC/CSTR-v0"\n"""\n')
     assert envs.names() == ["cstr", "double_pendulum", "linear"] and envs.load("cstr").name == "cstr"
+    shutil.copytree(ROOT / "envs", tmp_path / "here/envs")  # and while envs is imported
+    for path in (tmp_path / ".#cstr.py", tmp_path / "gone.py"):
+        (tmp_path / "here/envs" / path.name).symlink_to("nowhere")
     for number, env_id in enumerate(("My plant", "Tank-v0/", "RLMPC/CSTR", "Tank", "CartPole-v1")):
-        folder(f"odd_{number}", text=f"ENV_ID = {env_id!r}\n")
-        folder(f"odd_{number}", text="raise SystemExit\n")
-    code = f"import envs; envs.__path__.append({str(tmp_path)!r}); import importlib; importlib.reload(envs); print(envs.load('cstr'))"
-    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert out.stdout == "<plant cstr>\n", out.stderr
+        (tmp_path / f"here/envs/odd_{number}.py").write_text(f"ENV_ID = {env_id!r}\nraise SystemExit\n")
+    code = "import envs; print(envs.__path__, envs.load('cstr'), len(envs.names()))"
+    out = subprocess.run([sys.executable, "-c", code], cwd=tmp_path / "here", capture_output=True, text=True)
+    assert str(tmp_path) in out.stdout and "<plant cstr> 8" in out.stdout, out.stderr
 
 
 def test_other_files_are_no_plants_and_two_of_one_id_are_refused(folder):
@@ -317,6 +328,9 @@ def test_what_numpy_would_broadcast_is_refused():
             envs.GoalEnv(plant.name).compute_reward(np.zeros(achieved), np.zeros(goal))
         with pytest.raises(ValueError, match="shapes"):
             envs.time_near_goal(plant, np.zeros(achieved), np.zeros(goal))
+    observed = envs.load("cstr", observe_mismatch=np.ones(4))
+    assert observed.step(np.zeros(8) + observed.INIT_HIGH, cstr.U_LOW).shape == (8,)
+    assert envs.load("cstr", observe_mismatch=np.bool_(True)).MISMATCH_SCALE[0] == 0.02
     for scale in ([1.0, 2.0], 0.5, [-1.0, 1.0, 1.0, 1.0]):
         with pytest.raises(ValueError, match="scale of the mismatch"):
             envs.load("cstr", observe_mismatch=scale)
@@ -328,6 +342,12 @@ def test_environments_refuse_what_cannot_be():
         with pytest.raises(ValueError, match="reset: goal is .* it must lie in"):
             made.reset(options={"goal": [50.0]})
     vec.reset(seed=0)
+    some = {
+        "reset_mask": [True, False, True],
+        "goal": [[0.7], [0.0], [0.8]],
+    }  # the one between stays as it is
+    goals = vec.reset(options=some)[0]["desired_goal"].ravel()
+    assert goals[0] == 0.7 and goals[2] == 0.8 and goals[1] in (0.6, 0.7, 0.8)
     with pytest.raises(ValueError, match="reset_mask"):
         vec.reset(options={"reset_mask": np.array([0, 1, 0])})
     for wrong in (

@@ -29,7 +29,7 @@ class Scaling:
         others = [j for j in range(len(columns)) if j not in angles]
         values = affine("x", plant.INIT_LOW, plant.INIT_HIGH) | affine("u", plant.U_LOW, plant.U_HIGH)
         values |= affine("goal", plant.INIT_LOW[index], plant.INIT_HIGH[index])
-        values |= {"error_scale": plant.ERROR_SCALE.tolist(), "goal_index": list(index)}
+        values |= {"error_scale": plant.ERROR_SCALE.tolist(), "goal_index": index}
         return cls(**values, angle_index=angles, other_index=others)
 
     def features(self, x, goal, goal_input):

@@ -1,5 +1,6 @@
 """Checks of a script's arguments: ValueError, one sentence that names the argument, its value and what is allowed."""
 
+from dataclasses import fields
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Literal, Union, get_args, get_origin
@@ -26,8 +27,8 @@ def _converted(value, kind):
             raise TypeError(f"choose one of {', '.join(get_args(kind))}")
         return value
     if get_origin(kind) is tuple:
-        parts = value.tolist() if isinstance(value, np.ndarray) else value
-        parts = parts if isinstance(parts, (list, tuple)) else [parts]
+        parts = value.tolist() if hasattr(value, "tolist") else value  # of numpy or torch
+        parts = parts if isinstance(parts, (list, tuple, range)) else [parts]
         return tuple(_converted(part, get_args(kind)[0]) for part in parts)
     if kind is int and type(value) is float and value.is_integer() or kind is float and number:
         return kind(value)
@@ -45,12 +46,12 @@ def as_annotated(args):
 
     Raises ValueError for what does not fit.
     """
-    for name, kind in type(args).__annotations__.items():
-        value = getattr(args, name)
+    for field in fields(args):
+        value = getattr(args, field.name)
         try:
-            object.__setattr__(args, name, _converted(value, kind))
+            object.__setattr__(args, field.name, _converted(value, field.type))
         except TypeError as error:
-            raise ValueError(f"{flag(name)} is {value!r}; {error}") from None
+            raise ValueError(f"{flag(field.name)} is {value!r}; {error}") from None
 
 
 def flag(name):

@@ -22,11 +22,17 @@ def angles_on_one_scale(paths, goal):
 
     All paths end at the same turn.
     """
-    paths = [np.unwrap(path) for path in paths]
-    paths = [path + nearest_turn(goal[-1], paths[0][-1]) - nearest_turn(goal[-1], path[-1]) for path in paths]
+    paths = [np.array(path, dtype=float) for path in paths]
+    for path in paths:
+        known = np.isfinite(path)
+        path[known] = np.unwrap(path[known])
+    ends = [path[np.isfinite(path)][-1] for path in paths]
+    paths = [
+        path + nearest_turn(goal[-1], ends[0]) - nearest_turn(goal[-1], end) for path, end in zip(paths, ends)
+    ]
     changes = np.append(np.flatnonzero(np.diff(goal)), len(goal) - 1)
     last = changes[np.searchsorted(changes, np.arange(len(goal)))]  # step until which each goal holds
-    return paths, nearest_turn(goal, paths[0][last])
+    return paths, nearest_turn(goal, np.where(np.isfinite(paths[0]), paths[0], ends[0])[last])
 
 
 def draw_episode(plant, paths, goals, path):
@@ -65,7 +71,7 @@ def draw_episode(plant, paths, goals, path):
             ax.axhline(bound, color="black", lw=1, alpha=0.6, label="bound")
         if i in plant.ANGLES:
             low_turn, high_turn = np.round(np.array(ax.get_ylim()) / np.pi).astype(int)
-            turns = np.arange(low_turn, high_turn + 1)
+            turns = np.arange(low_turn, high_turn + 1, max((high_turn - low_turn) // 4, 1))
             multiples = [{0: "0", 1: "π", -1: "-π"}.get(k, f"{k}π") for k in turns]
             ax.set_yticks(np.pi * turns, [f"{m} ({('up', 'down')[k % 2]})" for m, k in zip(multiples, turns)])
         ax.set_title(titles[i], fontsize=10, loc="left")

@@ -52,9 +52,8 @@ DRAWN = {
 
 # where slack weights stand beside their marks: right of them or not, and how far, points
 LABELS_AT = {"RL+MPC, N = 5": (True, 6, 3), "RL+MPC, N = 5, paper's critic": (False, -7, -3)}
-CROWDED = {
-    ("RL+MPC, N = 5, paper's critic", panel, weight) for panel, weight in ((0, "2"), (1, "2"), (1, "0.3"))
-}
+BLIND = "RL+MPC, N = 5, paper's critic"
+CROWDED = {(BLIND, 0, "2"), (BLIND, 1, "2"), (BLIND, 1, "0.3")}  # curve, panel and weight
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ def answered(controller):
 
 def closed_loop(cell):
     """One case of one controller: the counts that are a row of the table."""
-    case, name, steps, seed, _ = cell
+    case, name, steps, seed, _ = cell  # and its critic's checksum: a new critic is a new cell
     controller, lasting = built(name), case in LASTING
     plant, rng = controller.plant, np.random.default_rng([seed, *case.encode(), *name.encode()])
     counts = collections.Counter({key: 0 for key in COUNTS})
