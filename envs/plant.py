@@ -55,13 +55,9 @@ SHAPES |= {"n_goal": "EVAL_GOAL GOAL_LOW GOAL_HIGH ERROR_SCALE", "*n_goal": "TRA
 SHAPES = {name: shape for shape, names in SHAPES.items() for name in names.split()}
 POSITIVE = "DT ERROR_SCALE REWARD_SIGMA2 REWARD_TOLERANCE MPC_SIGMA2 METRIC_SIGMA2 MISMATCH_SCALE".split()
 WHOLE = "EPISODE_STEPS", "MODEL_SUBSTEPS"
-KEYS = {
-    "BENCHMARK": ("horizon", "slack_price", "change_weight"),
-    "TRAINING": (
-        *("hidden", "total_timesteps", "num_envs", "gamma"),
-        *("steps_per_update", "learning_starts", "buffer_size", "alpha_init"),
-    ),
-}
+KEYS = {"BENCHMARK": ["horizon", "slack_price", "change_weight"]}
+KEYS["TRAINING"] = ["hidden", "total_timesteps", "num_envs", "gamma"]
+KEYS["TRAINING"] += ["steps_per_update", "learning_starts", "buffer_size", "alpha_init"]
 MAY_BE_INFINITE = "X_LOW", "X_HIGH", "OBS_LOW", "OBS_HIGH"
 
 
@@ -155,9 +151,8 @@ def _defaults(p):
         half, middle = (init_high - init_low) / 2, (init_low + init_high) / 2
     index, angles = p.GOAL_INDEX, getattr(p, "ANGLES", [])
     goal_low, goal_high = given("GOAL_LOW", init_low[index]), given("GOAL_HIGH", init_high[index])
-    wide = np.where(
-        half[index] > 0, half[index], (goal_high - goal_low) / 2
-    )  # a state may start at one value
+    # a state may always start at one value
+    wide = np.where(half[index] > 0, half[index], (goal_high - goal_low) / 2)
     scale = given("ERROR_SCALE", 0.05 * wide)
     width, turning = float(np.mean(scale)), np.isin(index, angles)
 
